@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from fieldtwin.gateway.core.clock import NS_PER_S, Clock
 from fieldtwin.gateway.core.concurrency.events import Consumer
 from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, NotAllowed, Unreachable
-from fieldtwin.gateway.core.image.image import TagSpec, message_tag
+from fieldtwin.gateway.core.image.image import TagSpec, consumed_name, message_tag
 from fieldtwin.gateway.core.values import DATA, NEVER, Quality, Reason, TagValue
 from fieldtwin.gateway.runtime.image_io import ImageExchange
 
@@ -31,6 +31,11 @@ TIMEOUT_NS = 2 * NS_PER_S
 def writes_tag(program: str) -> TagSpec:
     """Return the tag of the message input through which a program takes the writes of clients."""
     return message_tag(f"{program}.{WRITES}", MAX_WRITE_BYTES, MAX_WRITES)
+
+
+def is_of_writes(tag: str) -> bool:
+    """Return whether a tag belongs to the message input for writes, so that users do not see it."""
+    return tag.endswith((f".{WRITES}", consumed_name(f".{WRITES}")))
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,15 +39,21 @@ MAX_SOURCE_BYTES = 8 * 1024 * 1024
 
 
 def compile_source(
-    path: Path, dialect: Dialect = STANDARD, libraries: tuple[Path, ...] = (), *, machine_code: bool = False
+    path: Path | tuple[Path, ...],
+    dialect: Dialect = STANDARD,
+    libraries: tuple[Path, ...] = (),
+    *,
+    machine_code: bool = False,
 ) -> CompiledUnit:
     """Read and compile a file or a folder, with the declarations of `libraries` (files or folders) that it uses.
 
+    Several files and folders form one unit, which has the path of the first.
     With `machine_code` the programs get machine code (`fieldtwin.plc.st.native`), and a warning if that is not possible. Raises
     `FileInvalid` for the first error, with the others.
     """
     made = _with_machine_code if machine_code else _compiled
-    return made(source_texts((path,)), source_texts(libraries), str(path), dialect, _names_of(libraries))
+    paths = path if isinstance(path, tuple) else (path,)
+    return made(source_texts(paths), source_texts(libraries), str(paths[0]), dialect, _names_of(libraries))
 
 
 def read_with(
@@ -67,8 +73,12 @@ def read_with(
 
 
 def source_texts(paths: tuple[Path, ...]) -> Texts:
-    """Return the files of several sources with their content. Raises `FileInvalid`."""
-    return tuple((str(file), _text(file)) for path in paths for file in source_files(path))
+    """Return the files of several sources with their content, each file once. Raises `FileInvalid`."""
+    files: dict[Path, Path] = {}
+    for path in paths:
+        for file in source_files(path):
+            files.setdefault(file.resolve(), file)
+    return tuple((str(file), _text(file)) for file in files.values())
 
 
 def _text(path: Path) -> str:

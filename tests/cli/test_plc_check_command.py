@@ -29,6 +29,45 @@ def test_a_folder_is_checked_without_a_system(tmp_path: Path, monkeypatch: pytes
     assert (done.return_value, done.output) == (0, "2 files, no errors: 1 function, 1 program, 1 type\n")
 
 
+def test_several_files_and_folders_are_compiled_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("lib").mkdir()
+    Path("main.st").write_text("PROGRAM p VAR n, spare : Level; END_VAR n := twice(n); END_PROGRAM")
+    Path("types.st").write_text("TYPE Level : INT; END_TYPE")
+    Path("lib/twice.st").write_text(
+        "FUNCTION twice : INT VAR_INPUT n : INT; END_VAR VAR unused : INT; END_VAR twice := n * 2; END_FUNCTION"
+    )
+    done = checked("main.st", "types.st", "lib", "./lib/twice.st")  # a file that is named twice counts once
+    assert done.return_value == 0
+    lines = done.output.splitlines()
+    assert [line.partition(" ")[0] for line in lines[:-1]] == ["lib/twice.st:1:53:", "main.st:1:18:"]
+    assert lines[-1] == "3 files, no errors, 2 warnings: 1 function, 1 program, 1 type"
+    Path("types.st").write_text("TYPE Level : INT; END_TYPE FUNCTION f : INT f := TRUE; END_FUNCTION")
+    done = checked("main.st", "types.st", "lib")
+    assert (done.return_value, done.output.splitlines()[-1]) == (1, "1 error in 1 file")
+    assert done.output.startswith("types.st:1:50: assigned to f; expected INT")
+    data = json.loads(checked("lib", "types.st", "main.st", "--json").output)
+    assert [error["path"] for error in data["errors"]] == ["types.st"]
+
+
+@pytest.mark.parametrize(
+    ("second", "expected"),
+    [
+        ("missing.st", "no file or folder 'missing.st'; expected files and folders of programs"),
+        ("lab_vehicle.yaml", "several sources, and lab_vehicle.yaml is not a program"),
+    ],
+)
+def test_each_of_several_sources_is_a_file_or_folder_of_programs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, second: str, expected: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("p.st").write_text("PROGRAM p END_PROGRAM")
+    Path("lab_vehicle.yaml").write_text("fieldtwin: 1\n")
+    done = checked("p.st", second)
+    assert isinstance(done.exception, UsageError)
+    assert expected in str(done.exception)
+
+
 def test_every_error_has_a_line_and_the_exit_code_is_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("p.st").write_text("PROGRAM p VAR n : INT; END_VAR\nn := TRUE;\nm := 1;\nEND_PROGRAM")

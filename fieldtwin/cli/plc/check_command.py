@@ -17,7 +17,7 @@ from fieldtwin.cli.plc.sources import (
     agreed_system,
     dialect_option,
     library_option,
-    source_file,
+    source_files_together,
     st_tasks,
 )
 from fieldtwin.cli.template_question import TemplateSearchOptions
@@ -27,7 +27,7 @@ from fieldtwin.plc.st.dialects import chosen_ids
 
 
 @click.command("check")
-@click.argument("source", shell_complete=systems)
+@click.argument("programs", metavar="SOURCE...", nargs=-1, required=True, shell_complete=systems)
 @group(
     "Options",
     dialect_option,
@@ -49,7 +49,7 @@ from fieldtwin.plc.st.dialects import chosen_ids
 )
 @json_option
 def check(
-    source: str,
+    programs: tuple[str, ...],
     dialect: str | None,
     as_errors: tuple[str, ...],
     libraries: tuple[Path, ...],
@@ -60,10 +60,11 @@ def check(
     """Compile SOURCE and list all errors and warnings, one per line, with file, line and column. Nothing is run.
 
     SOURCE is a file of Structured Text, PLCopen XML or TwinCAT, a folder of such files, which are compiled together, or a system,
-    whose programs are checked. A file or folder needs no system.
+    whose programs are checked. A file or folder needs no system. Several files and folders are compiled together.
 
     \b
     fieldtwin plc check pump.st
+    fieldtwin plc check main.st blocks.st lib/
     fieldtwin plc check plc/ --dialect codesys --error ST002
     fieldtwin plc check observatory
 
@@ -75,12 +76,12 @@ def check(
     A part with a syntax error hides the errors of meaning in all others, and at most 51 errors of a unit are listed.
     Exit code 0 without errors, else 1.
     """
-    file = source_file(source, dialect, libraries)
+    named = source_files_together(programs, dialect, libraries)
     ids = chosen_ids(as_errors)
-    found = checked({file: {}}, ids) if file is not None else _checked_system(source, sources, ids)
-    programs = translated(found.units) if machine_code else []
+    found = checked({named: {}}, ids) if named is not None else _checked_system(programs[0], sources, ids)
+    in_machine_code = translated(found.units) if machine_code else []
     if as_json:
-        more = {"machine_code": [program.as_data() for program in programs]} if machine_code else {}
+        more = {"machine_code": [program.as_data() for program in in_machine_code]} if machine_code else {}
         click.echo(json.dumps({**found.as_data(), **more}, indent=2))
         return 1 if found.errors else 0
     for error in found.errors:
@@ -90,7 +91,7 @@ def check(
     for missing in found.missing():
         where = f"{missing.pos.path}:{missing.pos.line}:{missing.pos.column}"
         stdout.print(f"{where}: not imported: {missing.reason}", soft_wrap=True, markup=False)
-    for line in (line for program in programs for line in program.lines()):
+    for line in (line for program in in_machine_code for line in program.lines()):
         stdout.print(line, soft_wrap=True, markup=False)
     stdout.print(_summary(found), style="red" if found.errors else "green", soft_wrap=True, markup=False)
     return 1 if found.errors else 0

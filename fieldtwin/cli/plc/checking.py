@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from fieldtwin.cli.plc.sources import StSource, st_tasks
+from fieldtwin.cli.plc.sources import StSources, st_tasks
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.source_files import source_files
 from fieldtwin.plc.st.dialects import StWarning
@@ -58,7 +58,7 @@ class Checked:
 
 
 def checked(
-    programs: Mapping[StSource, Mapping[str, str]], as_errors: frozenset[str], systems: Iterable[System] = ()
+    programs: Mapping[StSources, Mapping[str, str]], as_errors: frozenset[str], systems: Iterable[System] = ()
 ) -> Checked:
     """Check each source, with the tasks of its programs (`st_tasks`), and the bindings of the programs of `systems`.
 
@@ -78,7 +78,8 @@ def checked(
             found.errors.extend((e, *e.others))
             continue
         found.units.append(unit)
-        own = {str(file) for file in source_files(path)}
+        paths = path if isinstance(path, tuple) else (path,)
+        own = {str(file) for each in paths for file in source_files(each)}
         about = [
             one for one in (*findings(unit.source), *written_by_several_tasks(unit.source, tasks)) if one.path in own
         ]
@@ -92,7 +93,7 @@ def checked(
 def checked_systems(systems: Iterable[System], as_errors: frozenset[str]) -> Checked:
     """Check the programs of systems and their bindings, each source and each system file once."""
     by_file = {system.file.path: system for system in systems}
-    programs: dict[StSource, dict[str, str]] = {}
+    programs: dict[StSources, dict[str, str]] = {}
     for system in by_file.values():
         for source, tasks in st_tasks(system).items():
             programs.setdefault(source, {}).update(tasks)

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 StSource = tuple[Path, Dialect, tuple[Path, ...]]
 """A file or folder of programs, its dialect, and its libraries."""
+StSources = tuple[Path | tuple[Path, ...], Dialect, tuple[Path, ...]]
+"""The same, or several files and folders that are compiled together."""
+_TOGETHER = "files and folders of programs, which are compiled together"
 _OF_SYSTEMS = (".yaml", ".yml")
 
 dialect_option: Callable[[Any], Any] = click.option(
@@ -49,6 +52,24 @@ def source_file(source: str, dialect: str | None, libraries: tuple[Path, ...]) -
     return None
 
 
+def source_files_together(
+    sources: tuple[str, ...], dialect: str | None, libraries: tuple[Path, ...]
+) -> StSources | None:
+    """Return `source_file` of one source, or several files and folders that are compiled together.
+
+    Raises `UsageError` if one of several is not a file or folder of programs.
+    """
+    if len(sources) == 1:
+        return source_file(sources[0], dialect, libraries)
+    for source in sources:
+        if not Path(source).exists():
+            raise UsageError(f"no file or folder {source!r}", expected=_TOGETHER)
+        if source_file(source, None, ()) is None:
+            hint = f"check the system alone: fieldtwin plc check {source}"
+            raise UsageError(f"several sources, and {source} is not a program", expected=_TOGETHER, hint=hint)
+    return tuple(map(Path, sources)), dialect_of(dialect or "standard"), libraries
+
+
 def agreed_system(system: str, sources: TemplateSearchOptions) -> System:
     """Return a system whose programs are read, after the user has agreed to this. Nothing is opened."""
     from fieldtwin.run.template import system_file
@@ -57,13 +78,13 @@ def agreed_system(system: str, sources: TemplateSearchOptions) -> System:
     return load_system(system_file(system, sources.ask(), plant=True, profiles=sources.profiles), sources.profiles)
 
 
-def st_tasks(system: System) -> dict[StSource, dict[str, str]]:
+def st_tasks(system: System) -> dict[StSources, dict[str, str]]:
     """Return the sources in Structured Text of a system, each once, with the task of each PROGRAM in it that the PLC runs.
 
     Names of a PROGRAM are in lower case; "" stands for the only one of a source.
     """
     first = next(iter(system.plc.tasks), "main")
-    found: dict[StSource, dict[str, str]] = {}
+    found: dict[StSources, dict[str, str]] = {}
     for name, source in st_sources(system).items():
         form = system.plc.programs[name]
         found.setdefault(source, {})[form.source.partition(":")[2].strip().lower()] = form.task or first

@@ -13,6 +13,7 @@ from msgspec import structs
 
 from fieldtwin.capture.decoding.exchange import SECRET
 from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.gateway.runtime.plc_variables import is_of_writes
 from fieldtwin.plc.status import PlcStatus, WholePlcStatus
 from fieldtwin.studio.live.present_tags import plain
 from fieldtwin.studio.live.process_image import ProcessImage
@@ -30,12 +31,13 @@ def whole_plc_status(
         return SECRET if tag in secrets else plain(value)
 
     inputs, outputs = image.inputs(), image.outputs()
-    values = {tag: shown(tag, outputs.values[n]) for tag, n in outputs.shape.index.items()}
+    values = {tag: shown(tag, outputs.values[n]) for tag, n in outputs.shape.index.items() if not is_of_writes(tag)}
     return WholePlcStatus(
         **structs.asdict(brief),
         inputs={
             tag: _input(brief, inputs.value(n)).describe(now_ns) | {"value": shown(tag, inputs.values[n])}
             for tag, n in inputs.shape.index.items()
+            if not is_of_writes(tag)
         },
         outputs=values,
         variables={

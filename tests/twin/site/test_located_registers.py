@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.runtime.plc_variables import is_of_writes
 from fieldtwin.gateway.runtime.serve import ServedTag
 from fieldtwin.twin.plant.physical import image_layout, program_warnings
 from fieldtwin.twin.site.system import System, load_system
@@ -82,6 +83,8 @@ def test_a_program_takes_writes_only_from_a_server_that_writes(tmp_path: Path) -
         layout = image_layout(system_of(tmp_path, "m AT %MW0 : INT;", server))
         names = {tag.name for region in layout.regions for tag in region.tags}
         assert ("p.st_writes" in names) is expected
+        hidden = {name for name in names if is_of_writes(name)}
+        assert hidden == ({"p.st_writes", "p.st_writes.consumed"} if expected else set())
 
 
 def test_bound_variables_are_read_where_their_values_are(tmp_path: Path) -> None:

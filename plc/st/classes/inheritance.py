@@ -23,26 +23,28 @@ _NAMES = {"FUNCTION_BLOCK": "a FUNCTION_BLOCK", "CLASS": "a CLASS", "INTERFACE":
 _STANDARD = frozenset(name.lower() for name in BLOCKS)
 
 
-def with_inherited(unit: t.SourceUnit) -> t.SourceUnit:
+def with_inherited(unit: t.SourceUnit, errors: ErrorCollector) -> tuple[t.SourceUnit, frozenset[str]]:
     """Return `unit` with the inherited variables in its POUs, each base before the POUs that extend it.
 
-    Charts and edges must have been translated before. Raises `FileInvalid` with line and column for the first error in an
-    EXTENDS or IMPLEMENTS, and with the others. A base that was not imported is left to the compiler, which names the reason.
+    Charts and edges must have been translated before. The errors in EXTENDS and IMPLEMENTS are added to `errors`, and the names
+    with an error are left out. Also return the POUs, in lower case, that lack variables and methods for this reason. A base that
+    was not imported is left to the compiler, which names the reason.
     """
     if not any(pou.extends or pou.implements for pou in unit.pous):
-        return unit
-    order = _Order(unit)
+        return unit, frozenset()
+    order = _Order(unit, errors)
     for pou in unit.pous:
         order.add(pou, ())
-    order.errors.raise_all()
-    return replace(unit, pous=tuple(order.done.values()))
+    return replace(unit, pous=tuple(order.done.values())), frozenset(order.incomplete)
 
 
 class _Order:
     """The POUs of a unit, each after its bases."""
 
-    def __init__(self, unit: t.SourceUnit) -> None:
-        self.errors = ErrorCollector()
+    def __init__(self, unit: t.SourceUnit, errors: ErrorCollector) -> None:
+        self.errors = errors
+        self.incomplete: set[str] = set()
+        """The POUs that do not inherit everything, because of an error, in lower case."""
         self.done: dict[t.Pos, t.Pou] = {}
         """By position: the POUs with their inherited variables."""
         self._pous = {pou.name.lower(): pou for pou in unit.pous}
@@ -52,21 +54,31 @@ class _Order:
         """Add a POU after its bases. `below` are the POUs that extend it, from the first to the last."""
         if pou.pos in self.done:
             return
-        for name in (*pou.extends, *pou.implements):
-            self._check(pou, name, name in pou.implements)
+        implements = tuple(name for name in pou.implements if self._is_right(pou, name, implements=True))
+        extends = [name for name in pou.extends if self._is_right(pou, name, implements=False)]
         if len(pou.extends) > 1 and pou.kind != "INTERFACE":
             self._bad(pou.extends[1].pos, f"{pou.name} extends two POUs", "one name after EXTENDS")
-        path = (*below, pou)
-        for name in pou.extends:
-            base = self._pous.get(name.name.lower())
-            if base in path:
-                chain = " -> ".join(one.name for one in (*path[path.index(base) :], base) if one is not None)
-                self._bad(name.pos, f"{pou.name} extends itself: {chain}")
-            elif base is not None and len(path) > MAX_BASES:
-                self._bad(name.pos, "a base extends others too often", f"at most {MAX_BASES} bases")
-            elif base is not None:
-                self.add(base, path)
-        self.done[pou.pos] = self._extended(pou)
+            del extends[1:]
+        extends = [name for name in extends if self._is_added(pou, name, (*below, pou))]
+        bases = {name.name.lower() for name in extends}
+        if len(extends) < len(pou.extends) or bases & self.incomplete:
+            self.incomplete.add(pou.name.lower())
+        self.done[pou.pos] = self._extended(replace(pou, extends=tuple(extends), implements=implements))
+
+    def _is_added(self, pou: t.Pou, name: t.NamedType, path: tuple[t.Pou, ...]) -> bool:
+        """Add the base `name` of a POU; return whether this is possible. `path` are the POUs that extend it."""
+        base = self._pous.get(name.name.lower())
+        if base is None:
+            return True  # it was not imported
+        if base in path:
+            chain = " -> ".join(one.name for one in (*path[path.index(base) :], base))
+            self._bad(name.pos, f"{pou.name} extends itself: {chain}")
+            return False
+        if len(path) > MAX_BASES:
+            self._bad(name.pos, "a base extends others too often", f"at most {MAX_BASES} bases")
+            return False
+        self.add(base, path)
+        return True
 
     def _extended(self, pou: t.Pou) -> t.Pou:
         found = [self._pous.get(name.name.lower()) for name in pou.extends[:1] if pou.kind != "INTERFACE"]
@@ -77,26 +89,27 @@ class _Order:
             self._bad(variable.pos, f"{variable.edge} of {variable.name}", f"no edge in a POU that {pou.name} extends")
         return replace(pou, blocks=(*(b for block in base.blocks for b in _inherited(base, block)), *pou.blocks))
 
-    def _check(self, pou: t.Pou, name: t.NamedType, implements: bool) -> None:
+    def _is_right(self, pou: t.Pou, name: t.NamedType, *, implements: bool) -> bool:
+        """Return whether a POU may extend or implement `name`. A name that was not imported counts as right."""
         allowed = ("INTERFACE",) if implements else _BASES.get(pou.kind, ())
         expected = " or ".join(_NAMES[kind] for kind in allowed)
         word = "IMPLEMENTS" if implements else "EXTENDS"
         found = self._pous.get(name.name.lower())
+        if found is None and name.name.lower() in self._missing:
+            return True
         if found is None and name.name.lower() in _STANDARD:
             self._bad(name.pos, f"{word} {name.name}: a standard function block cannot be extended", expected)
         elif found is None:
-            if name.name.lower() not in self._missing:
-                known = [one.name for one in self._pous.values() if one.kind in allowed]
-                self._bad(
-                    name.pos,
-                    f"{word} {name.name}: {name.name!r} is not declared",
-                    expected,
-                    did_you_mean(name.name, known),
-                )
+            known = [one.name for one in self._pous.values() if one.kind in allowed]
+            hint = did_you_mean(name.name, known)
+            self._bad(name.pos, f"{word} {name.name}: {name.name!r} is not declared", expected, hint)
         elif found.kind not in allowed:
             self._bad(name.pos, f"{word} {name.name}, which is a {found.kind}", expected)
         elif "FINAL" in found.modifiers:
             self._bad(name.pos, f"{pou.name} extends {found.name}, which is FINAL")
+        else:
+            return True
+        return False
 
     def _bad(self, pos: t.Pos, message: str, expected: str = "", hint: str = "") -> None:
         self.errors.add(invalid(pos, message, expected, hint=hint))

@@ -14,14 +14,16 @@ from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.errors import invalid
 
 
-def with_inherited_members(unit: t.SourceUnit, dialect: Dialect) -> t.SourceUnit:
+def with_inherited_members(
+    unit: t.SourceUnit, dialect: Dialect, errors: ErrorCollector
+) -> tuple[t.SourceUnit, frozenset[str]]:
     """Return `unit` with the inherited members in its structures.
 
-    Raises `FileInvalid` with line and column for the first error in an EXTENDS, and with the others. A base that was not imported
-    is left to the compiler, which names the reason.
+    The errors in declarations of structures are added to `errors`, and a base with an error is left out. Also return the
+    structures, in lower case, that lack members for this reason. A base that was not imported is left to the compiler, which
+    names the reason.
     """
     structures = {one.name.lower(): one for one in unit.types if isinstance(one, t.StructDecl)}
-    errors = ErrorCollector()
     hint = "the dialects codesys and twincat accept it"
     for one in structures.values() if not dialect.vendor else ():
         if one.union:
@@ -33,9 +35,9 @@ def with_inherited_members(unit: t.SourceUnit, dialect: Dialect) -> t.SourceUnit
     for one in structures.values():
         if one.union and not (one.extends or one.fields):
             errors.add(invalid(one.pos, f"the union {one.name} has no members", "at least one member"))
-    errors.raise_all()
     missing = {one.name.lower() for one in unit.missing}
     done: dict[str, t.StructDecl] = {}
+    incomplete: set[str] = set()
 
     def extended(one: t.StructDecl, below: tuple[str, ...]) -> t.StructDecl:
         key = one.name.lower()
@@ -44,28 +46,29 @@ def with_inherited_members(unit: t.SourceUnit, dialect: Dialect) -> t.SourceUnit
         members: tuple[t.VarDecl, ...] = ()
         for base in one.extends:
             of = structures.get(base.name.lower())
+            error = None
             if base.name.lower() in (*below, key):
-                errors.add(invalid(base.pos, f"{one.name} extends itself"))
+                error = invalid(base.pos, f"{one.name} extends itself")
             elif len(one.extends) > 1:
-                errors.add(invalid(one.extends[1].pos, f"{one.name} extends two structures", "one name after EXTENDS"))
+                error = invalid(one.extends[1].pos, f"{one.name} extends two structures", "one name after EXTENDS")
             elif of is not None and of.union != one.union:
                 what, other = ("UNION", "STRUCT") if one.union else ("STRUCT", "UNION")
-                errors.add(invalid(base.pos, f"{one.name} is a {what} and extends a {other}", f"the name of a {what}"))
+                error = invalid(base.pos, f"{one.name} is a {what} and extends a {other}", f"the name of a {what}")
             elif of is not None:
                 members = extended(of, (*below, key)).fields
             elif base.name.lower() not in missing:
-                hint = did_you_mean(base.name, [each.name for each in structures.values()])
-                errors.add(
-                    invalid(
-                        base.pos,
-                        f"EXTENDS {base.name}: {base.name!r} is not declared",
-                        "a UNION" if one.union else "a STRUCT",
-                        hint=hint,
-                    )
+                error = invalid(
+                    base.pos,
+                    f"EXTENDS {base.name}: {base.name!r} is not declared",
+                    "a UNION" if one.union else "a STRUCT",
+                    hint=did_you_mean(base.name, [each.name for each in structures.values()]),
                 )
+            if error is not None:
+                errors.add(error)
+            if error is not None or base.name.lower() in incomplete:
+                incomplete.add(key)
         done[key] = replace(one, fields=(*members, *one.fields))
         return done[key]
 
     types = tuple(extended(one, ()) if isinstance(one, t.StructDecl) else one for one in unit.types)
-    errors.raise_all()
-    return replace(unit, types=types)
+    return replace(unit, types=types), frozenset(incomplete)

@@ -9,6 +9,7 @@ The compiled code has no state: each `fieldtwin.plc.st.resource.Resource` runs i
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import CodeType
 from typing import Any, Protocol
@@ -134,10 +135,12 @@ class _Unit:
         for warning in unit.warnings:
             self.env.warnings.add(warning)
         self.out, self.source = CodeWriter(), unit
-        unit = with_inherited_members(with_called_programs(with_full_names(unit), dialect), dialect)
+        unit = with_called_programs(with_full_names(unit), dialect)
+        unit, structures = with_inherited_members(unit, dialect, self.env.errors)
         unit = with_configured(unit, vendor=dialect.vendor)
         self.unit = without_edges(without_charts(without_addresses(unit)))
-        self.unit = with_inherited(without_instance_variables(self.unit, dialect))
+        self.unit, pous = with_inherited(without_instance_variables(self.unit, dialect), self.env.errors)
+        self.env.incomplete = structures | pous
         if not dialect.vendor:
             self.unit = with_execution_control(self.unit)
         declared = {each.name.lower() for each in (*unit.pous, *unit.types)}
@@ -160,14 +163,14 @@ class _Unit:
                 with self.env.declaring(pou.name, self.env.faulty), self.declarations.within(pou):
                     self.env.functions[pou.name.lower()] = self.functions.signature(pou)
             elif pou.kind in KINDS:
-                with self.env.declaring(pou.name, self.env.faulty), self.declarations.within(pou):
+                with self.env.declaring(pou.name, self.env.faulty), self._within(pou):
                     hierarchy.add(pou)
 
     def compiled(self) -> CompiledUnit:
         programs = []
         for pou in self.unit.pous:
             self.env.faulty_here.clear()
-            with self.env.declaring(pou.name, self.env.faulty_here), self.declarations.within(pou):
+            with self.env.declaring(pou.name, self.env.faulty_here), self._within(pou):
                 if pou.kind == "FUNCTION":
                     if pou.name.lower() in self.env.functions:  # without an error in its declaration
                         self.functions.write(pou)
@@ -211,6 +214,16 @@ class _Unit:
             self.env,
             assigned=assigned,
         )
+
+    @contextmanager
+    def _within(self, pou: t.Pou) -> Iterator[None]:
+        """Make the constants of `pou` available. Names that it may inherit are no errors if an error hides its base."""
+        self.env.incomplete_here = pou.name.lower() in self.env.incomplete
+        try:
+            with self.declarations.within(pou):
+                yield
+        finally:
+            self.env.incomplete_here = False
 
     def _recorded_globals(self) -> frozenset[str]:
         """Return the attributes of the global variables that are assigned as a whole. The others have records of their parts."""

@@ -190,6 +190,8 @@ class Declarations:
             hint = "the dialects codesys and twincat accept it; the standard has REF_TO"
             self.env.fail(spec.pos, f"{word} is not in the standard", hint=hint)
         key = spec.of.name.lower() if isinstance(spec.of, t.NamedType) else ""
+        if key in self.env.incomplete:
+            raise self.env.following(key, spec.pos)
         if isinstance(spec.of, t.NamedType) and (key in self._blocks or isinstance(self._types.get(key), t.StructDecl)):
             declared = self._blocks.get(key) or self._types[key]
             self._pointed.append(spec.of)  # it may contain this reference
@@ -233,8 +235,11 @@ class Declarations:
             )
         return ty.MessagesOut(max_bytes, depth)
 
-    def named(self, name: str, pos: t.Pos) -> ty.Type:
+    def named(self, name: str, pos: t.Pos, *, as_base: bool = False) -> ty.Type:
+        """Return the type with this name. An incomplete one is only known in its own declaration, or `as_base` of others."""
         key = name.lower()
+        if key in self.env.incomplete and not as_base and not self._is_own(key, pos):
+            raise self.env.following(name, pos)
         found = ty.ELEMENTARY.get(name.upper()) or self.env.types.get(key)
         if found is not None:
             return found
@@ -250,6 +255,11 @@ class Declarations:
         self.env.types[key] = found
         self._resolve_pointed()
         return found
+
+    def _is_own(self, key: str, pos: t.Pos) -> bool:
+        """Return whether `pos` is the place of the declaration `key`."""
+        declared = self._blocks.get(key) or self._types.get(key)
+        return declared is not None and declared.pos == pos
 
     def _resolved(self, key: str, name: str, pos: t.Pos) -> ty.Type:
         if key in self._types:
@@ -406,7 +416,7 @@ class Declarations:
         total, nested = self.bounded(pou.pos, held)
         inputs, outputs, in_outs = members.values()
         order = tuple(v.name for block in pou.blocks if block.kind in ty.GIVEN for v in block.variables)
-        base = self.named(pou.extends[0].name, pou.extends[0].pos) if pou.extends else None
+        base = self.named(pou.extends[0].name, pou.extends[0].pos, as_base=True) if pou.extends else None
         actions = frozenset(action.name.lower() for action in pou.actions)
         bases, interfaces = frozenset[str](), self._interfaces(pou.implements)
         if isinstance(base, ty.Block):
@@ -427,7 +437,7 @@ class Declarations:
         """Return the interfaces with these names, and those that they extend, in lower case."""
         found: set[str] = set()
         for name in names:
-            kind = self.named(name.name, name.pos)
+            kind = self.named(name.name, name.pos, as_base=True)
             if isinstance(kind, ty.Interface):
                 found |= {kind.name.lower(), *kind.bases}
         return frozenset(found)

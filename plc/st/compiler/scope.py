@@ -212,6 +212,10 @@ class Environment:
     """The names of the unit whose declaration has an error, so that their use is not a second error."""
     faulty_here: set[str] = field(default_factory=set)
     """The same for the POU that is being compiled, and the names in it that are not declared at all."""
+    incomplete: frozenset[str] = frozenset()
+    """The structures and POUs, in lower case, that lack inherited members because of an error in an EXTENDS."""
+    incomplete_here: bool = False
+    """Whether the POU that is being compiled is one of them."""
     types: dict[str, ty.Type] = field(default_factory=dict)
     type_initials: dict[str, str] = field(default_factory=dict)
     functions: dict[str, Signature] = field(default_factory=dict)
@@ -293,10 +297,14 @@ class Environment:
 
     def unknown(self, pos: Pos, what: str, name: str, known: list[str], hint: str = "") -> NoReturn:
         """Raise the error of a name that is not declared. `hint` is the advice if none of the `known` names is similar."""
-        if name.lower() in self.faulty | self.faulty_here:
-            raise FollowingError(f"{name} is declared with an error", path=pos.path, line=pos.line, column=pos.column)
+        if name.lower() in self.faulty | self.faulty_here or (self.incomplete_here and what != "a type"):
+            raise self.following(name, pos)
         self.faulty_here.add(name.lower())
         self.fail(pos, f"{what} {name!r} is not declared", hint=did_you_mean(name, known) or hint)
+
+    def following(self, name: str, pos: Pos) -> FollowingError:
+        """Return the error of the use of `name`, whose declaration has an error. It is not reported."""
+        return FollowingError(f"{name} is declared with an error", path=pos.path, line=pos.line, column=pos.column)
 
     def of_library(self, name: str) -> str:
         """Return the advice for an unknown name before a dot, which may be the name of a library; "" in other dialects."""

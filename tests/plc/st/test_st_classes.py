@@ -472,3 +472,75 @@ def test_each_error_of_several_methods_is_reported_once() -> None:
         "a variable 'x' is not declared",
         "a variable 'y' is not declared",
     ]
+
+
+WRONG_BASES = """FUNCTION_BLOCK Valve EXTENDS Vlave
+VAR n : INT; inner : Pump; END_VAR
+METHOD PUBLIC OVERRIDE Open
+  position := 1;
+  n := TRUE;
+END_METHOD
+  SUPER();
+  Step();
+  THIS.Open();
+  inner(go := TRUE);
+  n := 'text';
+END_FUNCTION_BLOCK
+FUNCTION_BLOCK Vlve
+END_FUNCTION_BLOCK
+FUNCTION_BLOCK Special EXTENDS Valve
+VAR k : INT; END_VAR
+  k := position;
+  k := FALSE;
+END_FUNCTION_BLOCK
+CLASS Wrong EXTENDS Pump
+END_CLASS
+FUNCTION_BLOCK Pump
+VAR_INPUT go : BOOL; END_VAR
+VAR m : INT; END_VAR
+  m := TRUE;
+END_FUNCTION_BLOCK
+TYPE Both : STRUCT valve : Valve; x : INT; END_STRUCT; END_TYPE
+PROGRAM Main
+VAR valve : Valve; special : Special; both : Both; valves : ARRAY[1..2] OF Valve; ok : INT; no : Unknown; END_VAR
+  valve(wide := TRUE);
+  valve.Close();
+  ok := valve.position + special.position + both.valve.position;
+  valves[1](wide := TRUE);
+  ok := missing;
+END_PROGRAM
+"""
+
+
+def test_a_wrong_base_hides_no_other_errors_and_causes_none() -> None:
+    """Defect: an error in EXTENDS was the only one that was reported of a file."""
+    with pytest.raises(FileInvalid) as caught:
+        compile_text(WRONG_BASES, "p.st")
+    found = [(e.line, e.message) for e in (caught.value, *caught.value.others)]
+    assert sorted(found) == [
+        (1, "EXTENDS Vlave: 'Vlave' is not declared"),
+        (5, "assigned to n"),
+        (11, "assigned to n"),
+        (18, "assigned to k"),
+        (20, "EXTENDS Pump, which is a FUNCTION_BLOCK"),
+        (25, "assigned to m"),
+        (29, "a type 'Unknown' is not declared"),
+        (34, "a variable 'missing' is not declared"),
+    ]
+
+
+def test_a_wrong_base_of_a_structure_hides_no_other_errors_and_causes_none() -> None:
+    text = """TYPE A EXTENDS Bse : STRUCT x : INT; END_STRUCT
+    B EXTENDS A : STRUCT y : Unknown; END_STRUCT
+    C : STRUCT a : A; END_STRUCT END_TYPE
+    PROGRAM p VAR a : A; b : B; c : C; n : INT; ref : POINTER TO A; END_VAR
+    n := a.inherited + b.inherited + c.a.inherited; ref := ADR(a); n := ref^.inherited;
+    n := TRUE; END_PROGRAM"""
+    with pytest.raises(FileInvalid) as caught:
+        compile_text(text, "p.st", DIALECTS["codesys"])
+    found = [(e.line, e.message) for e in (caught.value, *caught.value.others)]
+    assert sorted(found) == [
+        (1, "EXTENDS Bse: 'Bse' is not declared"),
+        (2, "a type 'Unknown' is not declared"),
+        (6, "assigned to n"),
+    ]

@@ -38,6 +38,8 @@ def is_own(x: Compiling, ref: t.Ref) -> bool:
         x.env.fail(ref.pos, ref.name, expected=name[:-1].upper(), hint=hint)
     if x.own is None or x.own.kind == "PROGRAM":
         x.env.fail(ref.pos, f"{ref.name} outside a FUNCTION_BLOCK or CLASS")
+    if x.own.key in x.env.incomplete:
+        raise x.env.following(x.own.name, ref.pos)
     if name in SUPER and not x.own.ancestors:
         x.env.fail(ref.pos, f"{ref.name} in {x.own.name}, which extends nothing")
     return True

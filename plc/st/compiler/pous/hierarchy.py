@@ -55,7 +55,8 @@ class Hierarchy:
                 self._check_override(declared, method, before)
         if pou.kind in ("FUNCTION_BLOCK", "CLASS"):
             made.type = self.declarations.named(pou.name, pou.pos)
-            self._check_complete(pou, made)
+            if made.key not in self.env.incomplete:
+                self._check_complete(pou, made)
 
     def _is_variable(self, pou: t.Pou, name: str) -> bool:
         names = {v.name.lower() for block in pou.blocks for v in block.variables}
@@ -114,7 +115,7 @@ class Hierarchy:
 
     def _check_override(self, declared: t.Pou, method: Method, before: Method | None) -> None:
         if before is None:
-            if "OVERRIDE" in declared.modifiers:
+            if "OVERRIDE" in declared.modifiers and not self.env.incomplete_here:
                 self.env.fail(declared.pos, f"{method} is declared OVERRIDE, but no base has it")
             return
         if before.final:

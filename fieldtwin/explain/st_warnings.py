@@ -36,8 +36,10 @@ _MEANINGS = {
     ),
     "ST007": (
         "The compiler skips a pragma of a different tool. C code between `{{` and `}}` is not executed, "
-        "so a function that relies on it computes something else.",
-        "Check whether the program needs the pragma. Write the part in Structured Text if it does.",
+        "so a function that relies on it computes something else. In the dialects codesys and twincat, attributes that change "
+        "no result, such as `hide` and `symbol`, are skipped without this warning.",
+        "Check the spelling of the attribute, and whether the program needs the pragma. Write the part in Structured Text if it "
+        "does.",
     ),
     "ST008": (
         "The operands are of a signed and an unsigned type. They are computed in the smallest signed type that holds both, "

@@ -6,6 +6,7 @@ import re
 from functools import cache
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from lark import Lark, UnexpectedCharacters, UnexpectedEOF, UnexpectedToken
 from lark.exceptions import UnexpectedInput
@@ -29,6 +30,8 @@ _UNSUPPORTED = {
 }
 """The words of constructs that other compilers know, by which an error names the construct."""
 
+_UNNAMED = re.compile(r"(?::|\bOF\b|\bTO\b|\bREF_TO\b)\s*(?P<what>STRUCT|UNION)\s+\Z", re.IGNORECASE)
+"""The text before the first member of a structure or union in the declaration of a variable."""
 _LABEL = re.compile(r"(\A|;|\b(END_\w+|THEN|ELSE|DO|REPEAT))\s*[A-Za-z_]\w*\s*\Z", re.IGNORECASE)
 """The text before the colon of a label."""
 _READABLE = {
@@ -74,6 +77,8 @@ def invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:
     construct = _unsupported(got, text, line, column)
     if construct:
         return FileInvalid(f"{construct} are not supported", path=path, line=line, column=column, got=shortened(got))
+    if "SEMICOLON" in names and (unnamed := _unnamed(text, line, column)) is not None:
+        return FileInvalid(**unnamed, path=path)
     readable = sorted({_readable(name) for name in names})
     more = f" and {len(readable) - MAX_EXPECTED} more" if len(readable) > MAX_EXPECTED else ""
     return FileInvalid(
@@ -84,6 +89,27 @@ def invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:
         got=shortened(got if got.isprintable() else repr(got)),
         expected=", ".join(readable[:MAX_EXPECTED]) + more,
     )
+
+
+def _unnamed(text: str, line: int, column: int) -> dict[str, Any] | None:
+    """Return the error of a structure or union without a name whose first member is at this place; None if there is none.
+
+    The parser took its first word for the name of a type.
+    """
+    lines = text.split("\n")[:line]
+    lines[-1] = lines[-1][: column - 1]
+    before = "\n".join(lines)
+    found = _UNNAMED.search(before)
+    if found is None:
+        return None
+    what, at = found["what"].upper(), found.start("what")
+    return {
+        "message": f"a {what} without a name",
+        "line": before.count("\n", 0, at) + 1,
+        "column": at - before.rfind("\n", 0, at),
+        "expected": "the name of a type",
+        "hint": f"declare it, TYPE Name : {what} ... END_{what}; END_TYPE, and write Name here",
+    }
 
 
 def _unsupported(got: str, text: str, line: int, column: int) -> str:

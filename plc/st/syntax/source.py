@@ -12,6 +12,7 @@ import re
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.plc.st.dialects import STANDARD, Dialect, StWarning
 from fieldtwin.plc.st.syntax.conditional import Conditions, Wrong, is_directive
+from fieldtwin.plc.st.syntax.pragmas import is_silent
 
 MAX_CHARACTERS = 1_000_000
 """The longest file, in characters: some 30,000 lines."""
@@ -19,8 +20,6 @@ MAX_NAME = 255
 MAX_LITERAL = 4 * 65_535
 MAX_SHOWN = 60
 
-_HARMLESS = re.compile(r"\{\s*(attribute|region|endregion|text|info|warning|error)\b", re.IGNORECASE)
-"""Pragmas of CODESYS without effect on what a program computes; `qualified_only` is read by `project`."""
 _PACKED = re.compile(
     r"\{\s*attribute\s+'pack_mode'\s*:=\s*'[01248]'\s*\}(?=(?:\s|\{[^}]*\}|//[^\n]*\n|\(\*.*?\*\))*TYPE\b)",
     re.IGNORECASE | re.DOTALL,
@@ -114,7 +113,7 @@ def _end_of_pragma(
             text, start, "program text in another language is not supported", path, shortened(pragma),
             hint="the dialect matiec skips it",
         )  # fmt: skip
-    if warnings is not None and "ST007" in dialect.accepts and not (dialect.vendor and _HARMLESS.match(pragma)):
+    if warnings is not None and "ST007" in dialect.accepts and not (dialect.vendor and is_silent(pragma)):
         line, column = _place(text, start)
         shown = shortened(" ".join(pragma.split()))
         warnings.append(StWarning("ST007", f"this pragma is skipped: {shown}", path, line, column))

@@ -207,6 +207,16 @@ def test_a_name_in_two_global_lists_has_to_be_qualified(tmp_path: Path) -> None:
     ("pragma", "codesys", "matiec"),
     [
         ("{attribute 'hide'}", [], ["ST007"]),
+        ("{ Attribute  'Qualified_Only' }", [], ["ST007"]),
+        ("{attribute 'pack_mode' := '1'}", [], ["ST007"]),
+        ("{attribute 'TcRpcEnable' := '1'}", [], ["ST007"]),
+        ("{attribute 'OPC.UA.DA.Access' := '1'}", [], ["ST007"]),
+        ("{region 'inputs'}", [], ["ST007"]),
+        ("{warning disable C0195}", [], ["ST007"]),
+        ("{attribute 'hied'}", ["ST007"], ["ST007"]),
+        ("{attribute hide}", ["ST007"], ["ST007"]),
+        ("{attribute 'call_after_init'}", ["ST007"], ["ST007"]),
+        ("{attribute 'TcInitOnReset'}", ["ST007"], ["ST007"]),
         ("{disable code generation}", ["ST007"], ["ST007"]),
         ("{{ int x = 1; }}", None, ["ST007"]),
         ("{IF defined (SIM)}", None, None),
@@ -216,7 +226,7 @@ def test_a_name_in_two_global_lists_has_to_be_qualified(tmp_path: Path) -> None:
 def test_pragmas_are_skipped_with_a_warning_or_refused(
     pragma: str, codesys: list[str] | None, matiec: list[str] | None
 ) -> None:
-    for dialect, expected in (("codesys", codesys), ("matiec", matiec)):
+    for dialect, expected in (("codesys", codesys), ("twincat", codesys), ("matiec", matiec)):
         if expected is None:
             with pytest.raises(FileInvalid, match=r"p.st:3:1: "):
                 compiled(f"{pragma}\nr := 1;", dialect)

@@ -122,3 +122,29 @@ def test_a_type_without_an_initial_value_has_that_of_the_type_from_which_it_is_d
     assert (made["all"].m_level, made["all"].m_four.m_a, made["all"].m_line) == (3, 3, [3, 4, 0])
     made["some"][0][0] = 9
     assert made["some"] == [[9, 3], [3, 3]]
+
+
+@pytest.mark.parametrize(
+    ("declared", "place", "what"),
+    [
+        ("VAR x : STRUCT a : INT; END_STRUCT; END_VAR", (1, 19), "STRUCT"),
+        ("VAR\nx : ARRAY[1..2] OF struct\n\n a : INT; END_STRUCT; END_VAR", (2, 20), "STRUCT"),
+        ("VAR x : REF_TO STRUCT a : INT; END_STRUCT; END_VAR", (1, 26), "STRUCT"),
+        ("VAR x : STRUCT END_STRUCT; END_VAR", (1, 19), "STRUCT"),
+        ("VAR x : UNION a : INT; END_UNION; END_VAR", (1, 19), "UNION"),
+    ],
+)
+def test_a_structure_without_a_name_is_named_in_its_error(declared: str, place: tuple[int, int], what: str) -> None:
+    """Defect: the message was: not Structured Text; expected :=, ;, EDGE, REF=; got a."""
+    with pytest.raises(FileInvalid) as caught:
+        compile_text(f"PROGRAM p {declared} END_PROGRAM", "p.st")
+    error = caught.value
+    assert (error.line, error.column) == place
+    assert (error.message, error.expected) == (f"a {what} without a name", "the name of a type")
+    assert error.hint == f"declare it, TYPE Name : {what} ... END_{what}; END_TYPE, and write Name here"
+
+
+@pytest.mark.parametrize("text", ["TYPE A : STRUCT 5 : INT; END_STRUCT; END_TYPE", "PROGRAM p VAR STRUCT a : INT; END_VAR END_PROGRAM"])
+def test_other_errors_near_the_word_are_as_before(text: str) -> None:
+    with pytest.raises(FileInvalid, match="not Structured Text"):
+        compile_text(text, "p.st")

@@ -54,6 +54,9 @@ class BoundProgram:
     inputs: Mapping[str, InputBinding] = field(default_factory=dict)
     outputs: Mapping[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.program.bound_as(self.name)
+
     def variables(self, role: Role) -> list[Variable]:
         return [v for v in self.program.variables.values() if v.role is role]
 

@@ -320,6 +320,9 @@ class Program(ABC):
         """
         return None
 
+    def bound_as(self, name: str) -> None:
+        """Take over the name of the program in the system file, which its reasons show to users."""
+
     def last_assignment(self, name: str) -> tuple[SourceLine | None, Described | None]:
         """Return the line that assigned output `name` last, and its statement with what decided, each None if it is not known.
 

@@ -75,7 +75,7 @@ class StProgram(Program):
         self.st_resource = Resource.of(self.st_unit, together)
         self.st_body: Any = self.st_resource.created(f"P_{identifier(self.st_declared.name)}")
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
-        self.st_resource.bodies.append(self.st_body)
+        self.st_resource.add(self.st_body)
         self.st_variables = {v.name: v for v in self.st_declared.variables if v.name not in self.st_internal}
         """The variables that have tags, or can have them, by name."""
         inputs = [v for v in self.st_variables.values() if v.role == "input" and _tag_kind(v.kind) is not None]
@@ -223,6 +223,9 @@ class StProgram(Program):
             return record_of(*self.st_kept_in(variable), self.source_path)
         owner = self.st_resource.globals if variable.shared else self.st_body
         return record_of(owner, str(variable.attribute), (), self.source_path)
+
+    def bound_as(self, name: str) -> None:
+        self.st_resource.call(self.st_body, name)
 
     def last_assignment(self, name: str) -> tuple[SourceLine | None, Decided | None]:
         """Return the line that assigned the output, and its statement with what decided; for an output with its initial value,

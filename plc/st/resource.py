@@ -94,6 +94,8 @@ class Resource:
         self.globals: Any = self.space["_G"]
         self.bodies: list[Any] = []
         """The objects of the programs that use these global variables."""
+        self.names: list[str] = []
+        """The names of these programs in the system file, "" for an unknown one. Several may run the same PROGRAM."""
         if unit.machine_code is not None:
             self.space[RUNS] = unit.machine_code.load(self.space)
         self.absolute = ".scan_ns" in unit.python
@@ -138,6 +140,16 @@ class Resource:
         found: Resource = together[key]
         return found
 
+    def add(self, body: Any) -> None:
+        """Add the object of a program that uses these global variables."""
+        self.bodies.append(body)
+        self.names.append("")
+
+    def call(self, body: Any, name: str) -> None:
+        """Give the program with this object its name in the system file."""
+        at = next(n for n, one in enumerate(self.bodies) if one is body)
+        self.names[at] = name
+
     def begin(self, scan: ScanInfo, lookup: Callable[[str], TagValue]) -> None:
         """Prepare one execution of a program: from now on compiled code uses this scan and these global variables."""
         self.space["_G"] = self.globals
@@ -158,6 +170,7 @@ class Resource:
         new._has_references = self._has_references
         new.globals = copy.deepcopy(self.globals, memo)
         new.bodies = copy.deepcopy(self.bodies, memo)
+        new.names = [*self.names]
         return new
 
 

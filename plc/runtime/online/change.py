@@ -133,6 +133,7 @@ def prepare(runner: TaskRunner, versions: Mapping[str, Version]) -> OnlineChange
             continue
         made, reasons = fitted(version.made, bound, readers)
         new = made(together)
+        new.bound_as(bound.name)
         units = running.st_unit, new.st_unit
         key = id(units[0]), id(units[1])
         if key not in carrying:

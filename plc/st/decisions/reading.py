@@ -232,10 +232,10 @@ class DecisionReader:
         for waiting in (self._of_body(where.root), of_globals):
             if (found := self._place_in(waiting, part)) is not None:
                 return found
-        for body in where.resource.bodies:
+        for body, called in zip(where.resource.bodies, where.resource.names, strict=True):
             program = self._programs.get(type(body).__name__)
             if program is not None and body is not where.root:
-                name = f"program {program.name}"
+                name = f"program {called or program.name}"
                 if body is part:
                     return "", None, name
                 found = self._place_in(self._program(program)._of_body(body), part)

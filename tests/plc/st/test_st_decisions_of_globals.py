@@ -7,6 +7,7 @@ from typing import Any
 
 from st_bench import scan
 
+from fieldtwin.plc.binding import BoundProgram
 from fieldtwin.plc.st.compiler.compile import compile_text
 from fieldtwin.plc.st.dialects import DIALECTS
 from fieldtwin.plc.st.program import StProgram, program_class
@@ -225,3 +226,29 @@ def test_records_of_globals_are_no_part_of_the_state() -> None:
         scan(made)
         states.append(made.whole_state(0))
     assert states[0] == states[1]
+
+
+def test_two_programs_that_run_one_program_are_told_apart() -> None:
+    """Defect: both had the name of the PROGRAM, so a reader could not tell which of them assigned a variable."""
+    text = """VAR_GLOBAL total : INT; END_VAR
+FUNCTION_BLOCK Part VAR_INPUT x : INT; END_VAR VAR_EXTERNAL total : INT; END_VAR
+  IF x > 0 THEN total := x; END_IF
+END_FUNCTION_BLOCK
+PROGRAM Line VAR_INPUT n : INT; END_VAR VAR part : Part; END_VAR
+  part(x := n);
+END_PROGRAM
+PROGRAM Sum VAR_EXTERNAL total : INT; END_VAR VAR_OUTPUT shown : INT; END_VAR
+  shown := total;
+END_PROGRAM"""
+    unit, together = compile_text(text, "test.st"), {}
+    bound = [
+        BoundProgram(name, program_class(unit, pou)(together))
+        for name, pou in (("left", "Line"), ("right", "Line"), ("sum", "Sum"))
+    ]
+    left, right, total = [one.program for one in bound]
+    for number, writer in enumerate((left, right, left), 1):
+        left.n, right.n = (number if one is writer else 0 for one in (left, right))
+        for one in (left, right, total):
+            scan(one, number)
+        (inside,) = why(total, "shown")["inside"]
+        assert inside["executed_in"] == f"part of program {'left' if writer is left else 'right'}"

@@ -181,7 +181,7 @@ class _Site:
             self._systems[path] = system
             invariants_of(system, errors=self._errors)
             alarms_of(system, self._errors)
-            complete = system.devices.keys() == system.file.data.get("devices", {}).keys()  # else a device has an error
+            complete = system.devices.keys() == system.file.section("devices").keys()  # else a device has an error
             if complete and len(self._errors.errors) == before:
                 self._found.warnings += system.warnings
                 image_layout(system)

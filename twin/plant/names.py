@@ -36,5 +36,5 @@ def incomplete_in(system: System, programs: Iterable[BoundProgram]) -> frozenset
     """
     known = {*system.devices, *system.buses, *(program.name for program in programs)}
     return frozenset(
-        {*system.file.data.get("devices", {}), *system.file.data.get("buses", {}), *system.plc.programs} - known
+        {*system.file.section("devices"), *system.file.section("buses"), *system.plc.programs} - known
     )

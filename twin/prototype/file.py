@@ -105,7 +105,7 @@ def load_prototype(system: System, path: Path | None = None, errors: ErrorCollec
     must not be run. `system` may have been read in the same way.
     """
     if path is None and not prototype_path(system).exists():
-        if not system.file.data.get("buses"):  # nothing has to be emulated
+        if not system.file.section("buses"):  # nothing has to be emulated
             form = PrototypeForm(prototype_of=system.path.name)
             with collecting(errors) as collector:
                 return _resolve(system.file, form, system.path, system, collector)
@@ -131,7 +131,7 @@ def load_prototype(system: System, path: Path | None = None, errors: ErrorCollec
 
 def _resolve(file: YamlFile, form: PrototypeForm, path: Path, system: System, errors: ErrorCollector) -> Prototype:
     for section, names in (("buses", form.buses), ("devices", form.devices)):
-        declared = list(system.file.data.get(section, {}))
+        declared = list(system.file.section(section))
         for name in names:
             if name not in declared:
                 what = "bus" if section == "buses" else "device"

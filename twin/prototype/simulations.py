@@ -127,7 +127,7 @@ def _check_formulas(file: YamlFile, simulation: SimulationForm, name: str) -> No
 
 def _check_input(file: YamlFile, form: PrototypeForm, system: System, loc: tuple[str, ...], text: str) -> None:
     device, _, tag = text.partition(".")
-    if device in form.devices and device in system.file.data.get("devices", {}) and device not in system.devices:
+    if device in form.devices and device in system.file.section("devices") and device not in system.devices:
         raise FollowingError(f"the device {device!r} has an error", path=file.path)
     if device not in form.devices or device not in system.devices:
         emulated = [name for name in form.devices if name in system.devices]

@@ -97,7 +97,7 @@ def _matches(
     usable = [_exported(device, tag) for device, tag in matched if not _trouble(tag)]
     if usable:
         return usable
-    if len(devices) < len(file.data.get("devices", {})):
+    if len(devices) < len(file.section("devices")):
         raise FollowingError(f"{pattern!r} may match tags of a device that has an error", path=file.path)
     if matched:
         device, tag = matched[0]

@@ -23,7 +23,7 @@ def never_read_back(file: YamlFile, devices: Mapping[str, DeviceConfig]) -> tupl
     """
     found = []
     for name, device in devices.items():
-        writable = file.data["devices"][name].get("writable", [])
+        writable = file.section("devices")[name].get("writable", [])
         for at, local in enumerate(writable):
             tag = device.profile.tags.get(local)
             if tag is not None and tag.readable and not _read_again(device, tag):
@@ -50,7 +50,7 @@ def read_only_once(file: YamlFile, devices: Mapping[str, DeviceConfig]) -> tuple
     for name, device in devices.items():
         if device.profile.inbox is not None or device.profile.protocol != "modbus":
             continue
-        writable = file.data["devices"][name].get("writable", [])
+        writable = file.section("devices")[name].get("writable", [])
         groups: dict[str, list[Tag]] = {}
         for tag in device.profile.tags.values():
             if tag.readable and tag.poll not in ONCE and tag.name not in writable and not _read_again(device, tag):

@@ -14,7 +14,7 @@ def no_device(file: YamlFile, loc: tuple[Key, ...], name: str, others: Iterable[
     """Return the error of a reference to the device `name`. `others` are further names that the reference accepts; the message
     suggests the nearest name.
     """
-    declared = list(file.data.get("devices", {}))
+    declared = list(file.section("devices"))
     if name in declared:
         return FollowingError(f"the device {name!r} has an error", path=file.path)
     names = [*declared, *others]

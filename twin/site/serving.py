@@ -319,7 +319,7 @@ def _bridge(
 
 def _modbus_bus(file: YamlFile, loc: tuple[Key, ...], name: str, buses: Mapping[str, BusConfig]) -> None:
     known = [b.name for b in buses.values() if not b.endpoint.is_can]
-    if name in file.data.get("buses", {}) and name not in buses:
+    if name in file.section("buses") and name not in buses:
         raise FollowingError(f"the bus {name!r} has an error", path=file.path)
     if name not in known:
         raise file.error(

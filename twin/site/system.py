@@ -180,7 +180,7 @@ def _device(
 ) -> DeviceConfig:
     loc: tuple[Key, ...] = ("devices", name)
     if d.bus not in buses:
-        if d.bus in file.data.get("buses", {}):
+        if d.bus in file.section("buses"):
             raise FollowingError(f"the bus {d.bus!r} has an error", path=file.path)
         raise file.error(
             (*loc, "bus"), f"no bus {d.bus!r}", expected="one of " + ", ".join(buses), hint=did_you_mean(d.bus, buses)

@@ -87,7 +87,7 @@ def collect(system: System, profiles: Iterable[Path] = (), prototype: Path | Non
     got = Collected(f"systems/{system.path.name}")
     got.add(got.system_file, Item("system", system.path))
     for name, device in system.devices.items():
-        form = system.file.data["devices"][name]
+        form = system.file.section("devices")[name]
         _profile(got, system.path, form["profile"], device.profile)
         if dcf := form.get("dcf"):
             got.add(_place("devices", dcf, system.path), Item("dcf", find("devices", dcf, system.path, profiles)))

@@ -136,7 +136,7 @@ class ComposeCheck:
             return
         for index, value in service.options("listen"):
             bus = value.partition("=")[0]
-            if bus not in system.file.data.get("buses", {}):
+            if bus not in system.file.section("buses"):
                 yield self._file.error(
                     service.word(index),
                     f"no bus {bus!r} in {system.path.name}",
@@ -152,7 +152,7 @@ class ComposeCheck:
         given = service.option("instance")
         instance = given[1] if given else system.name + _INSTANCE_SUFFIX.get(command, "")
         made = {"emulate": ["field"], "run": ["gateway", "plc"]}.get(command, [command])
-        if command == "run" and not system.file.data.get("plc", {}).get("programs"):
+        if command == "run" and not system.file.section("plc").get("programs"):
             made = ["gateway"]
         for index, word in enumerate(service.health):
             match = _SOCKET.fullmatch(word)
@@ -219,7 +219,7 @@ def _commands_of(name: str) -> list[str]:
 def _hosts(file: YamlFile) -> set[str]:
     """Return the names by which containers reach each other: services, container names and aliases."""
     found: set[str] = set()
-    for name, form in file.data.get("services", {}).items():
+    for name, form in file.section("services").items():
         found.add(str(name))
         networks = form.get("networks") if isinstance(form, dict) else None
         for network in networks.values() if isinstance(networks, dict) else ():

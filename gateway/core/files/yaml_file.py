@@ -117,6 +117,11 @@ class YamlFile:
     data: dict[str, Any]
     positions: dict[tuple[Key, ...], Position]
 
+    def section(self, name: str) -> dict[str, Any]:
+        """Return the entries of a section as the user wrote them, also those with errors; none if the file has no such section."""
+        found = self.data.get(name)
+        return found if isinstance(found, dict) else {}
+
     def line(self, loc: tuple[Key, ...]) -> int:
         """Return the line of the key path `loc`, or of its nearest parent that is in the file."""
         return self._place(loc)[0]

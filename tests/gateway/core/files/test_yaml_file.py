@@ -160,3 +160,9 @@ def test_brackets_may_be_nested_up_to_the_limit_only() -> None:
     assert parse(inside, "x.yaml").data["a"] is not None
     with pytest.raises(FileInvalid, match=f"more than {MAX_NESTING} nested"):
         parse("a: " + "{b: " * (MAX_NESTING + 1), "x.yaml")
+
+
+def test_a_section_has_the_entries_as_the_user_wrote_them() -> None:
+    file = parse("a: {x: {y: 1}}\nb:\nc: [1]\nd: 5\n", "f.yaml")
+    assert file.section("a") == {"x": {"y": 1}}
+    assert [file.section(name) for name in ("b", "c", "d", "e")] == [{}, {}, {}, {}]

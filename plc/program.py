@@ -320,7 +320,7 @@ class Program(ABC):
         """
         return None
 
-    def bound_as(self, name: str) -> None:
+    def bound_as(self, name: str) -> None:  # noqa: B027  # only Structured Text has reasons with names of programs
         """Take over the name of the program in the system file, which its reasons show to users."""
 
     def last_assignment(self, name: str) -> tuple[SourceLine | None, Described | None]:

@@ -35,6 +35,4 @@ def incomplete_in(system: System, programs: Iterable[BoundProgram]) -> frozenset
     A program is also complete if all its variables are bound to tags, although it then publishes no name.
     """
     known = {*system.devices, *system.buses, *(program.name for program in programs)}
-    return frozenset(
-        {*system.file.section("devices"), *system.file.section("buses"), *system.plc.programs} - known
-    )
+    return frozenset({*system.file.section("devices"), *system.file.section("buses"), *system.plc.programs} - known)

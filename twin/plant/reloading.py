@@ -161,7 +161,9 @@ def _located(old: System, new: System) -> Iterator[ConfigChange]:
         names = sorted({tag.tag for tag in {*server.tags} ^ {*before[server.name].tags}})
         if names:
             change = _change(new.file, ("serve", server.name), "", "", live=False)
-            yield replace(change, what=f"serve.{server.name}: the registers of {', '.join(names)} change with the source")
+            yield replace(
+                change, what=f"serve.{server.name}: the registers of {', '.join(names)} change with the source"
+            )
 
 
 def _fixed(device: DeviceConfig) -> tuple[object, ...]:

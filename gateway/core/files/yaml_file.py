@@ -118,7 +118,7 @@ class YamlFile:
     positions: dict[tuple[Key, ...], Position]
 
     def section(self, name: str) -> dict[str, Any]:
-        """Return the entries of a section as the user wrote them, also those with errors; none if the file has no such section."""
+        """Return the entries of a section as the user wrote them, also those with errors; none without such a section."""
         found = self.data.get(name)
         return found if isinstance(found, dict) else {}
 

@@ -144,7 +144,9 @@ def test_a_structure_without_a_name_is_named_in_its_error(declared: str, place: 
     assert error.hint == f"declare it, TYPE Name : {what} ... END_{what}; END_TYPE, and write Name here"
 
 
-@pytest.mark.parametrize("text", ["TYPE A : STRUCT 5 : INT; END_STRUCT; END_TYPE", "PROGRAM p VAR STRUCT a : INT; END_VAR END_PROGRAM"])
+@pytest.mark.parametrize(
+    "text", ["TYPE A : STRUCT 5 : INT; END_STRUCT; END_TYPE", "PROGRAM p VAR STRUCT a : INT; END_VAR END_PROGRAM"]
+)
 def test_other_errors_near_the_word_are_as_before(text: str) -> None:
     with pytest.raises(FileInvalid, match="not Structured Text"):
         compile_text(text, "p.st")

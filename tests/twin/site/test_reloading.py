@@ -119,7 +119,11 @@ def test_a_located_variable_whose_register_changes_is_named_with_its_server(plan
     """Defect: the change was called `serve`, a key that the user had not edited."""
     edit(plant, ("remote: remote", 'serve: {hmi: {url: "tcp://127.0.0.1:0", addresses: openplc}}'))
     program = plant.with_name("fill.st")
-    edit(program, ("target := 2.0;", "kept := 1;"), ("END_VAR\nVAR_OUTPUT", "END_VAR VAR kept AT %MW3 : INT; END_VAR VAR_OUTPUT"))
+    edit(
+        program,
+        ("target := 2.0;", "kept := 1;"),
+        ("END_VAR\nVAR_OUTPUT", "END_VAR VAR kept AT %MW3 : INT; END_VAR VAR_OUTPUT"),
+    )
     before = load_system(str(plant))
     edit(program, ("%MW3 : INT;", "%MW4 : INT; added AT %MW5 : INT;"))
     (change,) = compare(before, load_system(str(plant)))

@@ -217,7 +217,7 @@ class _Unit:
 
     @contextmanager
     def _within(self, pou: t.Pou) -> Iterator[None]:
-        """Make the constants of `pou` available. Names that it may inherit are no errors if an error hides its base."""
+        """Make the constants of `pou` available. If its base is unknown because of an error, an unknown name is not reported."""
         self.env.incomplete_here = pou.name.lower() in self.env.incomplete
         try:
             with self.declarations.within(pou):

@@ -92,7 +92,7 @@ def invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:
 
 
 def _unnamed(text: str, line: int, column: int) -> dict[str, Any] | None:
-    """Return the error of a structure or union without a name whose first member is at this place; None if there is none.
+    """Return the error of a structure or union without a name whose first member is at this place; otherwise return None.
 
     The parser took its first word for the name of a type.
     """

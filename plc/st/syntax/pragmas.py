@@ -20,7 +20,7 @@ _KNOWN = frozenset(
     # symbols for other systems, and the code that a vendor's linker keeps
     | {"symbol", "linkalways", "external_name", "signature_flag", "reflection", "enable_dynamic_creation"}
     | {"no_instance_in_retain"}
-    # checks and warnings of the vendor's compiler, and code of its own checks
+    # checks, warnings and options of the vendor's compiler
     | {"analysis", "naming", "nameprefix", "no-check", "no_check", "no_assign", "no_assign_warning"}
     | {"estimated-stack-usage", "use_overload_resolution", "checksuperglobal"}
 )

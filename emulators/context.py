@@ -192,7 +192,7 @@ class VirtualContext:
         access.
         """
         if self._origin is not None or self._fixed or command.data in self._series:
-            raise Bug("a series for a command that is there, or of a context that is fixed")
+            raise Bug("a series for a command that already exists, or in a context that is fixed")
         if len(self._series) >= self.max_entries:
             raise FileInvalid("the recording holds too many different requests", expected=str(self.max_entries))
         self._series[command.data] = _Series(self.when_used_up, recorded, whole=True)

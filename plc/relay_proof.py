@@ -63,7 +63,9 @@ PROOF = Proof(
     key=lambda relay: relay.key,
     invariants={
         "the state follows from the sign of the period": lambda r: r.state == STATE_CODES[delta(r.period_s).name],
-        "what is commanded to the sensor is the period": lambda r: r.period == r.period_s == r.logic.period_s,
+        "the commanded period of the sensor is the period of the relay": lambda r: (
+            r.period == r.period_s == r.logic.period_s
+        ),
         "nothing is logged while the period is 0 or below": lambda r: r.period_s > 0 or r.logged == r.logged_before,
         "every response leaves, waits or is counted as dropped": lambda r: r.unaccounted == 0,
         "responses leave unaltered": lambda r: all(data == _SHORT for _, data in r.response.pending),

@@ -59,7 +59,7 @@ _TEXTS: dict[int, tuple[str, str, str]] = {
     ),
     0x0B: (
         "gateway target device failed to respond",
-        "A gateway passed the request on, but the device behind it did not answer. Usually the device is off, has another "
+        "A gateway forwarded the request, but the device behind it did not answer. Usually the device is off, has another "
         "unit ID, or the wiring, baud rate or parity on its line is wrong.",
         "Check unit ID and wiring. `fieldtwin scan` on the gateway's address shows which unit IDs answer. The gateway's "
         "own timeout must be shorter than the client's.",

@@ -28,7 +28,7 @@ _REASONS: dict[Reason, tuple[str, str]] = {
     ),
     Reason.UNREACHABLE: (
         "The endpoint cannot be opened, or the connection was lost: no such host or port, refused, cable pulled, bus-off.",
-        "The device's error in the live view says what the operating system reported. The gateway tries again by itself.",
+        "The device's error in the live view contains the message of the operating system. The gateway tries again by itself.",
     ),
     Reason.STALE: (
         "The last good value is older than the tag's maximum age, so it may no longer be true.",
@@ -78,19 +78,19 @@ _QUALITIES: dict[Quality, tuple[str, str]] = {
     Quality.GOOD: ("The value was read within its maximum age and passed all checks.", "Nothing."),
     Quality.SUBSTITUTED: (
         "The value was bad, and the program's input has the substitute that its `if_bad` states.",
-        "The reason beside it says why: `fieldtwin explain timeout`.",
+        "The reason next to it explains the cause: `fieldtwin explain timeout`.",
     ),
     Quality.UNCERTAIN: (
-        "A value is there, but something is doubtful: it is out of its range, or the device repeats an old sample.",
-        "The reason beside it says what: `fieldtwin explain out of range`.",
+        "The device has a value, but it is doubtful: it is out of its range, or the device repeats an old sample.",
+        "The reason next to it explains the doubt: `fieldtwin explain out of range`.",
     ),
     Quality.SIMULATED: (
         "A person forces the value, or a simulation substitutes it.",
         "`fieldtwin plc status` lists forces; `fieldtwin plc unforce TAG` removes one.",
     ),
     Quality.BAD: (
-        "There is no value that may be used. A program's `if_bad` states what it sees instead.",
-        "The reason beside it says why: `fieldtwin explain timeout`.",
+        "No value may be used. A program's `if_bad` states the value that the program gets instead.",
+        "The reason next to it explains the cause: `fieldtwin explain timeout`.",
     ),
 }
 

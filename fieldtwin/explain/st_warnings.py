@@ -12,7 +12,7 @@ _MEANINGS = {
         "Copy the input to a local variable and change the copy.",
     ),
     "ST002": (
-        "A value is converted to a type that does not hold every value of its own type, such as DINT to INT. "
+        "A value is converted to a type that cannot represent every value of the source type, such as DINT to INT. "
         "Bits that do not fit are cut off, and a REAL loses digits.",
         "Write the conversion (`DINT_TO_INT`) where the loss is intended; otherwise declare a wider type.",
     ),
@@ -30,7 +30,7 @@ _MEANINGS = {
         "Declare the variable as a bit string, or convert it first.",
     ),
     "ST006": (
-        "An enumeration is used as a number, or a number as an enumeration. A number that is no value of the enumeration "
+        "An enumeration is used as a number, or a number as an enumeration. A number that the enumeration does not have "
         "stops the task when it is assigned.",
         "Use the names of the values, or an integer variable.",
     ),

@@ -11,7 +11,7 @@ _SOURCE = "docs/explanation/conformance.md"
 _VERDICTS: dict[Verdict, tuple[str, str]] = {
     Verdict.PASSED: ("The device, client or system did what the test case or scenario requires.", "Nothing."),
     Verdict.FAILED: (
-        "It did not do what the test case or scenario requires; the reason says what was seen, and when.",
+        "It did not do what the test case or scenario requires; the reason has the observation and its time.",
         "Run it alone with `--only ID`; the report of `--html` has every byte. An accepted failure belongs in a file for "
         "`--waivers`.",
     ),
@@ -21,14 +21,14 @@ _VERDICTS: dict[Verdict, tuple[str, str]] = {
     ),
     Verdict.INCONCLUSIVE: (
         "The result proves neither a pass nor a failure: it cannot be decided from outside, the other side did not behave "
-        "normally before, nothing was there to judge, or this computer was late. It does not count as passed.",
-        "Read the reason beside it. Often an option is missing, such as `--timeout` or `--probe`; after a late computer run it "
+        "normally before, no observation was possible, or this computer was late. It does not count as passed.",
+        "Read the reason next to it. Often an option is missing, such as `--timeout` or `--probe`; after a late computer run it "
         "again.",
     ),
     Verdict.SKIPPED: (
         "The test case or scenario does not apply: another kind of bus, no such request, an option or a permission that was "
         "not given; or its failure is waived.",
-        "Read the reason beside it. `--allow write` and `--allow disrupt` permit more cases on a device.",
+        "Read the reason next to it. `--allow write` and `--allow disrupt` permit more cases on a device.",
     ),
 }
 _BASES: dict[Basis, str] = {

@@ -59,7 +59,9 @@ def _check_source(file: YamlFile, simulation: SimulationForm, name: str) -> None
         expected = "one of `formulas:`, `python: FILE.py:CLASS` and `fmu: FILE.fmu`"
         raise file.error(loc, f"the simulation of {name!r}", expected=expected)
     if simulation.fmu is None and simulation.variables:
-        raise file.error((*loc, "variables"), "`variables` belongs to an FMU", expected="`fmu: FILE.fmu` beside it")
+        raise file.error(
+            (*loc, "variables"), "`variables` belongs to an FMU", expected="`fmu: FILE.fmu` in the same simulation"
+        )
     if simulation.fmu is not None:
         bind_fmu(file, simulation, name)
     if simulation.python is not None and not _python(file, simulation.python)[0].is_file():
@@ -74,7 +76,7 @@ def check_plays(file: YamlFile, form: PrototypeForm, name: str, profile: DeviceP
     device = form.devices[name]
     if device.plays and device.simulation is None:
         raise file.error(
-            ("devices", name, "plays"), "`plays` without a simulation", expected="`simulation: NAME` beside it"
+            ("devices", name, "plays"), "`plays` without a simulation", expected="`simulation: NAME` of the same device"
         )
     for tag, value in device.plays.items():
         loc = ("devices", name, "plays", tag)

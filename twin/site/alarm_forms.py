@@ -18,7 +18,7 @@ class AlarmForm(SiteModel):
     condition: str = Field(description="an expression as in scenarios", examples=["tank.level > 4.5"])
     priority: Priority = "medium"
     text: str = Field(
-        default="", max_length=200, description="what the operator reads", examples=["Tank level is high"]
+        default="", max_length=200, description="the text that the operator reads", examples=["Tank level is high"]
     )
     on_delay_ms: Delay = Field(default=0, description="how long the condition is true before the alarm is active, ms")
     off_delay_ms: Delay = Field(

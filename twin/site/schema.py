@@ -398,10 +398,12 @@ class SimulationForm(SiteModel):
     step_ms: float = Field(default=100.0, ge=0.1, le=60_000)
     formulas: dict[Name, Formula] = Field(default={}, description="name -> formula of t, dt, inputs and each other")
     python: str | None = Field(
-        default=None, description="FILE.py:CLASS, beside this file; it has step(t_s, dt_s, inputs)"
+        default=None, description="FILE.py:CLASS, in the folder of this file; it has step(t_s, dt_s, inputs)"
     )
     fmu: str | None = Field(
-        default=None, description="FILE.fmu, beside this file: FMI 2.0 or 3.0, co-simulation", examples=["tank.fmu"]
+        default=None,
+        description="FILE.fmu, in the folder of this file: FMI 2.0 or 3.0, co-simulation",
+        examples=["tank.fmu"],
     )
     variables: dict[Name, str] = Field(
         default={}, description="FMU: name -> the FMU's variable; default: equal names", examples=[{"level": "tank.h"}]

@@ -61,7 +61,7 @@ class ModbusServeForm(SiteModel):
         if not self.tags and self.addresses is None:
             raise ValueError("a server needs `tags` or `addresses`")
         if self.write and self.addresses is None:
-            raise ValueError("`write` is for `addresses`; a tag has a `write` of its own")
+            raise ValueError("`write` is for `addresses`; a tag has a separate key `write`")
         return self
 
 

@@ -98,7 +98,7 @@ def _dump(path: Path) -> Dump:
     if not dump.passes:
         raise FileInvalid("a dump without values", path=str(path))
     if not dump.ended:
-        stderr.print(f"{path.name} was interrupted: what it lacks is not compared", soft_wrap=True)
+        stderr.print(f"{path.name} was interrupted: the missing parts are not compared", soft_wrap=True)
     return dump
 
 

@@ -205,7 +205,7 @@ class _Job:
             return self._dry(dry_point(target).read_frames(tags))
         counters, lost = PollCounters(), 0
         if self._log:
-            raise UsageError("--log: what is recorded of a bus is all of it already")
+            raise UsageError("--log: a recording of a CAN bus already contains all its frames")
         with RotatingFile(self._out, **self._parts) as file:
             sink = CanLogSink(file, self._clock, Endpoint.parse(target.url).path.rpartition("/")[2].replace(":", "_"))
 

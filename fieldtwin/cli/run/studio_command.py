@@ -62,7 +62,7 @@ class TraceOptions:
         "--at", type=Duration(), default=None, metavar="TIME", help="Show this instant of the TRACE first."
     )
     system: str = option(
-        "--system", default="", metavar="SYSTEM", help="The system of a TRACE without a description beside it."
+        "--system", default="", metavar="SYSTEM", help="The system of a TRACE that has no description in its folder."
     )
 
     def check(self, trace: Path | None) -> None:

@@ -136,7 +136,7 @@ def _secured(system: System, name: str | None) -> tuple[OpcuaServeConfig, OpcuaS
         [name] = servers
     if name is None or name not in servers:
         raise UsageError(
-            "which OPC UA server of the system is meant" if name is None else f"no OPC UA server {name!r}",
+            "no OPC UA server is selected" if name is None else f"no OPC UA server {name!r}",
             expected="--server " + " or ".join(servers) if servers else "a server of kind opcua in `serve`",
         )
     server = servers[name]

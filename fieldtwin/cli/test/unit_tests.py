@@ -45,7 +45,7 @@ class UnitTestOptions:
         "--library",
         type=click.Path(path_type=Path, exists=True),
         multiple=True,
-        help="A file or folder whose declarations unit tests may use, besides the files in their folder. Can be repeated.",
+        help="A file or folder whose declarations unit tests may use, in addition to the files in their folder. Can be repeated.",
     )
 
     def words(self) -> tuple[str, ...]:

@@ -33,7 +33,7 @@ def draft_profile(inference: Inference, dumps: Sequence[Dump], name: str = "") -
     series, unit = inference.series, int(dumps[0].header["address"])
     slug = "".join(c if c.isalnum() and c.isascii() else "-" for c in name.lower()).strip("-") or f"unit-{unit}"
     lines = [
-        "# Drafted by `fieldtwin infer`: what the registers probably are. Check it against the manual, name the tags, add units.",
+        "# Drafted by `fieldtwin infer`: the probable types of the registers. Check them in the manual, name tags, add units.",
         f"# {series.passes} passes over {series.span_s:.0f} s, {_day(series.times_s[0])}. "
         "certain: nothing else fits; likely: at least 80 %; guess: at least 50 %; unknown: less.",
         *_states(dumps),

@@ -293,7 +293,7 @@ def _refusal_checks(refusals: RefusalsStatus, expected: Collection[str], *, dist
     if len(told) > MOST_REFUSED:
         told[MOST_REFUSED:] = [f"{len(told) - MOST_REFUSED} more outputs were refused"]
     if not found and not expected and any(refusals.faults.get(fault) for fault in faults):
-        told = ["so many outputs of programs were refused that the first are no longer listed: see the audit log"]
+        told = ["too many outputs of programs were refused, so the first ones are not listed: see the audit log"]
     return told
 
 

@@ -103,7 +103,7 @@ def _system_of(path: Path, about: TraceAbout | None, named: str, profiles: tuple
         raise FileInvalid(
             "the trace has no description, so its system is not known",
             path=str(path),
-            expected=f"the file {path.name}.about.json, which the run has written beside it",
+            expected=f"the file {path.name}.about.json, which the run has written into the same folder",
             hint="name the system: fieldtwin studio TRACE --system SYSTEM",
         )
     own = Path(about.system_path)

@@ -45,7 +45,7 @@ def as_scenario(recording: Recording, name: str, system: str) -> str:
     expected = [list(_expected(recording, n)) for n in range(len(recording.actions))]
     return "\n".join(
         [
-            "# Recorded in Studio: what was done to the simulated devices, and what was then observed.",
+            "# Recorded in Studio: the actions on the simulated devices, and the observations after them.",
             "# Studio proposes the expectations. Delete those that do not matter, and write down those that do: a rule under",
             "# `always`, such as \"quality(DEVICE.TAG) != 'good' or age(DEVICE.TAG) <= 2.5 s\", is checked all the time.",
             *(["# The recording is incomplete: it had too many changes."] if recording.is_full else []),

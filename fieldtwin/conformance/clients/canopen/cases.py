@@ -65,7 +65,7 @@ CASES: tuple[CanopenCase, ...] = (
     _case("CO-004", "unknown command specifier", ROBUST, "7.2.4", READ, plays.unknown_command, aborts_with(0x05040001,
           0x05040000), "answers with E0h", "abort with 05040001, or with 05040000 once it has waited").on(strikes=1),
     _case("CO-005", "a reply for another object", REQUIRED, "7.2.4; canopen-stack #132", READ, plays.other_object, checks.rejects,
-          "answers for another index", "never take it for the one that was asked for"),
+          "answers for another index", "never mistake it for the requested object"),
     _case("CO-006", "write refused", REQUIRED, "7.2.4", Impact.WRITE, plays.refuses_write, checks.survives,
           "aborts a download at once with 06010002", "end the transfer; go on").on(wants="download"),
     _case("CO-008", "missing index", REQUIRED, "7.2.4", READ, plays.no_object, checks.survives, "aborts with 06020000", "go on"),

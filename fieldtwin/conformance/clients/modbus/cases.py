@@ -147,7 +147,7 @@ CASES: tuple[ModbusCase, ...] = (
     _watch("MB-065b", "few connections", ROBUST, "TG 4.2.1", few_connections, "close connections that it no longer uses"
           ).on(framings=STREAM),
     _good("MB-051", "TCP byte by byte", REQUIRED, "TG 3.1.3", tcp_plays.bytewise,
-          "sends each byte in a TCP segment of its own").on(framings=TCP),
+          "sends each byte in a separate TCP segment").on(framings=TCP),
     _good("MB-052", "several ADUs in one segment", REQUIRED, "TG 3.1.3, 4.4.1.3; OpenPLC #253; pymodbus #1949",
           tcp_plays.with_stranger,
           "sends a reply with an unknown transaction id and its own reply in one segment",

@@ -47,7 +47,7 @@ class ConfiguredParts:
             if not address or area_of(address) != area_of(part.location):
                 self._fail(one, f"the address {one.location}", expected=f"an address in %{area_of(part.location)}")
             if address in self._taken or self._addresses.setdefault(address, one) is not one:
-                self._fail(one, f"{one.location} is the address of another variable", expected="an address of its own")
+                self._fail(one, f"{one.location} is the address of another variable", expected="a different address")
         return address
 
     def write_initials(self, out: CodeWriter, program: t.Pou) -> None:

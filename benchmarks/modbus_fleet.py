@@ -68,7 +68,7 @@ class Idle(Program):
 
 
 def make_files(folder: Path, devices: int) -> Path:
-    """Write the system file of so many devices, each on a separate host, with its prototype file."""
+    """Write the system file of this number of devices, each on a separate host, with its prototype file."""
     (folder / "idle_program.py").write_text(PROGRAM)
     (folder / PROFILE).write_text(METER)
     lines: list[dict[str, Any]] = [

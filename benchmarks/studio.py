@@ -151,7 +151,7 @@ class Server:
             return found
 
     def wait_for(self, total: int) -> float:
-        """Wait until so many frames are indexed; return the seconds that it took."""
+        """Wait until this number of frames is indexed; return the duration in seconds."""
         begun = time.monotonic()
         while self.total() < total:
             if time.monotonic() - begun > INDEXED_WITHIN_S:

@@ -124,7 +124,7 @@ def _add_to_text(report: pytest.TestReport, title: str, content: str) -> None:
     sections, add the section to the report after the text.
     """
     add = getattr(report.longrepr, "addsection", None)
-    if add is None:  # --tb=native, or a plugin with a text of its own
+    if add is None:  # --tb=native, or a plugin with a different text
         report.sections.append((title, content))
     else:
         add(title, content)

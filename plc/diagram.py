@@ -165,7 +165,7 @@ def _arrow(
         return f'<path class="arrow" d="M{x1:.1f},{y1:.1f} {bend}"/>{_tip(x2, y2, atan2(y2 - py, x2 - px))}'
     dx, dy = b.x - a.x, b.y - a.y
     length = hypot(dx, dy)
-    sway = 34.0 if both else 0.0  # two opposite transitions are two arrows, and each bends to its right
+    sway = 34.0 if both else 0.0  # two transitions in reverse directions are two arrows, and each bends to its right
     px, py = (a.x + b.x) / 2 - dy / length * sway * 2, (a.y + b.y) / 2 + dx / length * sway * 2
     x1, y1 = a.edge(atan2(py - a.y, px - a.x))
     x2, y2 = b.edge(atan2(py - b.y, px - b.x))

@@ -410,7 +410,7 @@ class Program(ABC):
     def resume(self, known: Mapping[str, Scalar]) -> None:
         """Continue from known values of the outputs and locals. Called before the first scan.
 
-        A program that has state besides its variables overrides this. Raises `UsageError` for a value that a variable
+        A program with state in addition to its variables overrides this. Raises `UsageError` for a value that a variable
         cannot hold.
         """
         for v in self.variables.values():

@@ -53,7 +53,7 @@ def source_paths(folder: Path) -> Iterator[Path]:
 
 
 def _is_of_another_tool(path: Path) -> bool:
-    """Return whether an XML file has other content than a program, such as beremiz.xml beside a project of OpenPLC Editor."""
+    """Return whether an XML file has other content than a program, such as beremiz.xml in a project of OpenPLC Editor."""
     if path.suffix.lower() != ".xml":
         return False
     try:

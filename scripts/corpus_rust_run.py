@@ -31,7 +31,7 @@ _UNCHANGED = {"unwrap", "clone", "to_string", "into", "as_str", "iter", "as_ref"
 
 
 class Differs(Exception):
-    """The text says which expectation of the test does not hold."""
+    """The text names the expectation of the test that does not hold."""
 
 
 class Interpreter:

@@ -1,4 +1,4 @@
-"""The listening side of TCP and TLS: each client becomes a `ByteConnection`, served by a coroutine of its own.
+"""The listening side of TCP and TLS: each client becomes a `ByteConnection`, served by a separate coroutine.
 
 It does not interpret the bytes. The numbers of clients, of chunks per client and of outgoing bytes are limited.
 """

@@ -1,4 +1,4 @@
-"""A fault as given in a file or a scenario: its name, what it aims at, its parameters.
+"""A fault as given in a file or a scenario: its name, its target and its parameters.
 
 faults:
   - {id: dead, name: silence, device: ctd, from: 5s, until: 12s}

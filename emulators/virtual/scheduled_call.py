@@ -46,4 +46,4 @@ class ScheduledCall(Struct, eq=False, weakref=True):
 
 
 def _do_nothing() -> None:
-    """Stand in for the callback of a cancelled call."""
+    """Replace the callback of a cancelled call."""

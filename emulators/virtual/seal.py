@@ -119,7 +119,7 @@ def sealed() -> Iterator[None]:
 def unsealed() -> Iterator[None]:
     """Permit this thread what `sealed` refuses, until the end of the context, also if it is not sealed.
 
-    It is for a part of a simulated device that has a process of its own, such as an FMU. The caller must wait for each of its
+    It is for a part of a simulated device that has a separate process, such as an FMU. The caller must wait for each of its
     answers: then the run does not depend on the computer.
     """
     thread = threading.get_ident()

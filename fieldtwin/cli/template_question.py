@@ -54,7 +54,7 @@ def code_of(files: tuple[str, ...]) -> list[str]:
 
 
 def ask_about(template: ForeignParts) -> bool:
-    """Print what a template contains and ask whether it may run. Without a terminal the answer is no."""
+    """Print what a template contains and ask whether it may run. Without a terminal the answer counts as no."""
     for code in code_of(template.code):
         stderr.print(
             f"{escape(str(template.path))} contains {code}.\n"

@@ -65,7 +65,7 @@ class DeviceView:
         return self._device.output if self._controlled else None
 
     def served(self, place: int) -> list[ServedValue]:
-        """Return what an HMI reads of the device number `place`: beside a program its supervised value, else all polled ones."""
+        """Return the values of device number `place` that an HMI reads: with a program the supervised one, else all polled."""
         if self._controlled:
             return served_values([self._number], place)
         return served_values((t for t in self._device.profile.tags.values() if t.poll in self.polled), place)

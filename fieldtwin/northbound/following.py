@@ -14,7 +14,7 @@ from fieldtwin.twin.plant.physical import gateway_lost_ms, plc_lost_ms
 from fieldtwin.twin.site.system import System
 
 TEXTS_EVERY_NS = NS_PER_S // 2
-"""The interval in which the gateway is asked for texts, in nanoseconds."""
+"""The interval in which texts are requested from the gateway, in nanoseconds."""
 Changes = Iterator[tuple[str, Sample]]
 
 

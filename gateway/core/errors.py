@@ -1,4 +1,4 @@
-"""The error classes. An error names the part that has to be corrected, what was expected and received, where, and what to do.
+"""The error classes. An error names the part to correct, the expected and the received value, the place, and the remedy.
 
 Every error that fieldtwin raises to its callers is a `FieldtwinError`. Exceptions of the operating system and of libraries
 (``OSError``, pymodbus, python-can) are translated once, where they arise; the calling code does not catch them. A value of

@@ -1,7 +1,7 @@
 """The plan by which a poll group is read: with the fewest transactions, and without the gaps that the device was found to have.
 
 Neighbouring registers are read together, over gaps up to a profile's `max_gap`. A device that refuses such a read with exception
-02 (address) or 03 (too many) has a gap in it or a limit of its own. The read is then halved until each part is accepted or is a
+02 (address) or 03 (too many) has a gap in it or a smaller limit. The read is then halved until each part is accepted or is a
 single value. The gaps that this proves are kept and offered for the profile (case 25 of the test-case list). A gap is proved when
 the device accepts the reads on both sides of it, but refuses one read that covers both. A value or a message is never split over
 two transactions.

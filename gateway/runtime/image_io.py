@@ -1,7 +1,7 @@
 """The gateway's side of the process image: it publishes inputs, reads outputs, and checks whether the PLC is alive.
 
-`exchange` runs once per PLC cycle. It never waits: it reads the newest complete publication of the PLC and publishes
-one of its own.
+`exchange` runs once per PLC cycle. It never waits: it reads the newest complete publication of the PLC, and
+publishes one of the gateway.
 """
 
 from __future__ import annotations

@@ -313,7 +313,7 @@ class TagServer:
         """Write variables of the PLC, which take effect together. The client gets the answer after the scan that used them."""
         function = pdu[0]
         if self._plc is None or any(not cell.served.variable and cell.served.tag for cell in cells):
-            raise refusal(function, ILLEGAL_ADDRESS)  # a tag that is no writable variable
+            raise refusal(function, ILLEGAL_ADDRESS)  # a tag that is not a writable variable
         values: dict[str, dict[str, float]] = {}
         for served in (cell.served for cell in cells if cell.served.variable):
             value = unpack(served.type, served.order, _part(pdu, served, access))

@@ -16,8 +16,9 @@ from fieldtwin.gateway.store.schema import migrate, refuse_newer
 
 QUEUE = 10_000
 KNOWN = 1_000
-"""The number of rows at the end of the store that are compared with new rows, so that no row is stored twice. A PLC cannot
-have that many unconfirmed rows.
+"""The number of rows at the end of the store that are compared with new rows, so that no row is stored twice.
+
+A PLC cannot have this number of unconfirmed rows.
 """
 
 

@@ -130,7 +130,7 @@ class Scan:
         self._steady = False
         """Whether the inputs of the last scan were those of the scan before."""
         self._columns: Sequence[Scalar | None] = []
-        """The values of INPUTS that the last scan read. They are the same object as long as nothing but a time changed."""
+        """The values of INPUTS that the last scan read. They are the same object as long as only a time changed."""
         self._given = ""
         """The inputs of the programs with qualities and reasons, and the counters of taken messages, of the last scan."""
         self._by_tag: dict[str, list[_Input]] = {}

@@ -63,7 +63,7 @@ def read_with(
     dialect: Dialect,
     changed: Callable[[SourceUnit], SourceUnit],
 ) -> tuple[SourceUnit, list[SourceUnit]]:
-    """Read the file `path` with the declarations of the files `beside` it and of `libraries` that it uses.
+    """Read the file `path` with the declarations that it uses from the files `beside` and from `libraries`.
 
     `changed` is applied to each file. Also return the other files as they were read. Raises `FileInvalid`.
     """

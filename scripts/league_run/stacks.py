@@ -50,7 +50,7 @@ def load() -> tuple[dict[str, Any], list[Entry]]:
 
 
 def install(name: str, stack: dict[str, Any]) -> Path:
-    """Install the stack in its exact versions below the cache, unless it is there; return its folder."""
+    """Install the stack in its exact versions below the cache, unless it exists; return its folder."""
     folder = CACHE / name
     stamp, wanted = folder / "installed.json", json.dumps(stack, sort_keys=True)
     if stamp.is_file() and stamp.read_text() == wanted:

@@ -1,4 +1,4 @@
-"""The CANopen keys of a system file, resolved: what a bus's NMT master produces, and how each node is booted.
+"""The CANopen keys of a system file, resolved: the messages of a bus's NMT master, and the boot procedure of each node.
 
 DCF files are read here, so that an error in one is reported with file, section and key before any connection is opened.
 """

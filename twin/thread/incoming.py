@@ -1,8 +1,8 @@
 """Store and forward between two twins, the receiver of other sides' logs (`outgoing` is the sender).
 
-Sans-IO. `IncomingLogs` is given the received frames, what is stored, and the time, and returns what to send and what to store. It
-answers ASK for an unknown tag, REFUSED for an unknown schema, else ACK, which confirms only what is in the store. The ranges
-after a gap and the streams are bounded.
+Sans-IO. `IncomingLogs` is given the received frames, the stored events and the time, and returns the frames to send and the
+events to store. It answers ASK for an unknown tag, REFUSED for an unknown schema, else ACK, which confirms only what is in
+the store. The ranges after a gap and the streams are bounded.
 """
 
 from __future__ import annotations

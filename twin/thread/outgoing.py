@@ -1,8 +1,8 @@
 """Store and forward between two twins, the sender: at least once on the link, exactly once in the log, in any order of frames.
 
-Sans-IO. `OutgoingLog` is given the received frames, what is stored, and the time, and returns what to send and to load. An ACK
-confirms only what is in the receiver's store (`incoming`). Either side may therefore die at any instant, and as soon as frames
-arrive again the two logs become equal.
+Sans-IO. `OutgoingLog` is given the received frames, the stored events and the time, and returns the frames to send and the
+events to load. An ACK confirms only what is in the receiver's store (`incoming`). Either side may therefore die at any
+instant, and as soon as frames arrive again the two logs become equal.
 
 It sends HELLO until acknowledged, then DATA within a bounded window. It retransmits what an ACK reports missing, and what was not
 confirmed in time (RFC 6298, doubled up to a minute). It sends LOST for events that are no longer in the log.

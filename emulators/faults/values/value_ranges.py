@@ -51,9 +51,9 @@ def check_value(tag: Tag, value: float, name: str, hint: str = "") -> None:
 def beyond(tag: Tag, name: str) -> float:
     """Return a value outside of the declared range of `tag`: the largest that its type can carry, or else the smallest.
 
-    If no range is declared, it is the largest value of the type. For a tag with a scale factor of its own, infinity
-    stands for the largest raw number; the device limits it. Raises `WrongAim` if the type carries no value outside of
-    the range.
+    If no range is declared, it is the largest value of the type. For a tag with a separate scale factor, infinity
+    represents the largest raw number; the device limits it. Raises `WrongAim` if the type carries no value outside of the
+    range.
     """
     if tag.scale_by is not None:
         return math.inf

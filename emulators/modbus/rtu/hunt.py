@@ -23,8 +23,8 @@ from fieldtwin.emulators.modbus.rtu.shapes import (
 
 LOST_AFTER = 4 * MAX_FRAME
 """The number of bytes without a frame after which the search only considers frames to the units served here, with functions
-whose length is known. In so much garbage, frames of other units do not help to resynchronise, and a check of every byte costs
-too much.
+whose length is known. In garbage of this length, frames of other units do not help to resynchronise, and a check of every
+byte costs too much.
 """
 
 IDLE_NOISE = 4

@@ -16,7 +16,7 @@ from typing import Protocol
 from fieldtwin.gateway.core.clock import NS_PER_S
 
 OVERHEAD_BYTES = 8
-"""The number of bytes of a packet besides its payload: preamble, address and checksum."""
+"""The number of bytes of a packet in addition to its payload: preamble, address and checksum."""
 MAX_RESENDS = 50
 
 

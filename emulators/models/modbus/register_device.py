@@ -133,7 +133,7 @@ def _number(tag: Tag, text: float | str) -> float:
     if tag.is_bit and text in _BITS:
         return _BITS[str(text)]
     if isinstance(text, str) and not tag.is_text and _WHOLE.fullmatch(text):
-        return float(int(text, 0))  # an identity is text, whatever the type of the register
+        return float(int(text, 0))  # an identity is text, for any type of the register
     expected = ", ".join(word for _, word in tag.values) or ("true or false" if tag.is_bit else "a number")
     if tag.is_text:
         expected = "text" if tag.type == "string" else "none: bytes cannot be stated"

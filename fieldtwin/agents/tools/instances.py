@@ -139,7 +139,7 @@ async def why(work: Workplace, given: OfTag) -> dict[str, Any]:
 
 
 def explanation(quality: str, reason: str) -> list[dict[str, str]]:
-    """Return what a quality other than good and its reason mean, and what to do."""
+    """Return the meaning of a quality other than good and of its reason, and the remedy."""
     words = [] if quality == str(Quality.GOOD) else [quality, *([reason] if reason != str(Reason.NONE) else [])]
     return [{"word": e.id, "meaning": e.meaning, "what_to_do": e.todo} for word in words for e in explain(word)]
 

@@ -139,7 +139,7 @@ def print_tags(rows: list[Row]) -> None:
 
 
 def _width() -> int:
-    """Return the number of columns: the terminal's; for a pipe so many that nothing is cut off."""
+    """Return the number of columns: the terminal's; for a pipe a number that is large enough for all lines."""
     return stdout.width if stdout.is_terminal else IN_A_PIPE
 
 
@@ -269,7 +269,7 @@ def acts_text(acts: dict[str, int]) -> str:
 def print_why(tag: str, changes: list[dict[str, Any]], waits_for: str = "") -> None:
     """Print which program last changed a tag, and from which inputs.
 
-    `waits_for`: what the program that writes the tag waits for before it starts.
+    `waits_for`: the inputs for which the program that writes the tag waits before it starts.
     """
     if waits_for:
         stdout.print(f"{tag}: its program has not started; missing {waits_for}", markup=False, soft_wrap=True)

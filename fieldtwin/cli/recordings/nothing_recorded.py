@@ -22,5 +22,5 @@ OF_POLLING = "check that the profile has readable tags, and let the recording ru
 
 
 def nothing_recorded(what: str, where: str, seconds: float, check: str) -> str:
-    """Return the message: `what`, such as ``no byte passed``, `where`, and in how many seconds; `check` says what to do."""
+    """Return the message: `what`, such as ``no byte passed``, `where`, and in how many seconds; `check` is the remedy."""
     return f"nothing was recorded: {what} at {where} in {seconds:.1f} s; {check}"

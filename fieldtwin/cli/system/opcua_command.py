@@ -84,8 +84,8 @@ def user_command(
 ) -> int:
     """Add USER to the users of an OPC UA server of SYSTEM, or change or remove the user.
 
-    The password is asked for, or is the first line of stdin. The file holds a hash of it. A running server reads the file at each
-    log-in; a session that is open keeps its role.
+    The command prompts for the password, or reads it from the first line of stdin. The file holds a hash of it. A running
+    server reads the file at each log-in; a session that is open keeps its role.
     """
     system = load_system(str(system_file), profiles)
     server, security = _secured(system, name)

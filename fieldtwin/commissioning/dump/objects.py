@@ -14,7 +14,7 @@ from fieldtwin.gateway.protocols.canopen.eds.dictionary import ObjectDictionary
 
 NO_OBJECT, NO_SUBINDEX = 0x0602_0000, 0x0609_0011
 MOST_MISSING = 8
-"""Number of consecutive missing subindices after which the rest of an array is skipped, whatever the value of its subindex 0."""
+"""Number of consecutive missing subindices after which the rest of an array is skipped, for any value of its subindex 0."""
 LEVELS = ((0x1000,), (0x100, 0x800), (0x40,), (0x10,))
 """Steps at which profiles usually begin groups of objects, the likeliest first."""
 EVERYTHING = ((0x1000, 0x9FFF),)

@@ -45,7 +45,7 @@ R = TypeVar("R", bound=CaseResult)
 
 
 def waive(result: R, waivers: Waivers, today: date) -> R:
-    """Return the result with its waiver applied, if there is one. An expired waiver is a failure, whatever the finding."""
+    """Return the result with its waiver applied, if there is one. An expired waiver is a failure, independent of the finding."""
     waiver = waivers.of(result.case.id, result.case.row)
     if waiver is None:
         return result

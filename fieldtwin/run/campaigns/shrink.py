@@ -115,7 +115,7 @@ def shrunk_run(
 def kind_of(error: str) -> str:
     """Return an error without its numbers, so that the same failure at a different time or value has the same kind.
 
-    A broken rule is the same, whatever the values of its tags were.
+    A broken rule is the same for all values of its tags.
     """
     return _NUMBER.sub("#", error.partition(BROKEN_AT)[0])
 

@@ -195,7 +195,7 @@ class _Units(Generic[UNIT, T]):
                 self._repeat_later.append(unit)
 
     def _submit(self, unit: _Unit[UNIT, T], workers: Sequence[str] | None = None) -> None:
-        # the workers are a preference: a unit for workers that have all gone must not wait for ever
+        # the workers are a preference: a unit for workers that have all gone must not wait forever
         future = self._opened.client.submit(
             run_unit,
             self._opened.campaign,

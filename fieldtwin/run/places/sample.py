@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence
 
 ONE_OF = 100
-"""One of so many seeds is repeated, and at least one."""
+"""One seed of this number of seeds is repeated, and at least one."""
 
 
 def sample_of(seeds: Sequence[int]) -> frozenset[int]:

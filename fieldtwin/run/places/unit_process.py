@@ -41,7 +41,7 @@ def read_message(file: BinaryIO) -> bytes | None:
 def main(argv: list[str]) -> None:
     """Run units until the input ends."""
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a user's program prints must not get between the answers
+    os.dup2(2, 1)  # output of a user's program must not mix with the answers
     os.chdir(argv[1])
     requests = sys.stdin.buffer
     work: Any = pickle.loads(read_message(requests) or b"")

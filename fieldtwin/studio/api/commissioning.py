@@ -58,7 +58,7 @@ async def get_guide(request: Request) -> dict[str, Any]:
 async def show_command(request: Request) -> dict[str, Any]:
     """Return the command line of a step, without running it.
 
-    A form that is being filled in is often invalid, so that is a normal answer: `problem` says what is wrong with it.
+    A form that is being filled in is often invalid, so that is a normal answer: `problem` describes the error.
     """
     try:
         form = await body_of(request, StepForm)

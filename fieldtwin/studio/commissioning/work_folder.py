@@ -142,7 +142,7 @@ class WorkFolder:
         if len(content) > MOST_DRAFT_BYTES:
             raise UsageError("the profile is too long", expected=f"at most {MOST_DRAFT_BYTES} bytes")
         if path.exists():
-            self.listed(name)  # a page must not replace a file that is no profile
+            self.listed(name)  # a page must not replace a file that is not a profile
             if version != _version(path.read_bytes()):
                 raise CheckFailed(
                     f"{name} has changed since the editor read it", hint="open it again, or save it under another name"

@@ -55,7 +55,7 @@ def _system_of(prototype: Path) -> Path:
 
 
 def instance_name(system: Path) -> str:
-    """Return a valid name of an instance for a system file, whatever the file is called."""
+    """Return a valid name of an instance for a system file with any name."""
     return re.sub(r"[^A-Za-z0-9._-]", "-", system.stem).lstrip("._-")[:40] or "system"
 
 

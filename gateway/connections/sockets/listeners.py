@@ -133,8 +133,8 @@ class TcpListener:
     ) -> TcpListener:
         """Listen on a ``tcp://`` or ``tls://`` endpoint; port 0 selects a free port (`bound` has its number).
 
-        Raises `EndpointBusy` if the port is in use, `Unreachable` if it cannot be opened for another reason; a hint says what to
-        do. Raises `UsageError` for any other kind of endpoint.
+        Raises `EndpointBusy` if the port is in use, `Unreachable` if it cannot be opened for another reason; a hint has the
+        remedy. Raises `UsageError` for any other kind of endpoint.
         """
         if endpoint.scheme not in ("tcp", "tls"):
             raise UsageError(

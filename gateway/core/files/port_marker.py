@@ -37,7 +37,7 @@ def mark_port(link: Path, device: str) -> int:
     beside.unlink(missing_ok=True)
     descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
     try:
-        os.fchmod(descriptor, 0o644)  # every user that may open the port can check it, whatever the umask
+        os.fchmod(descriptor, 0o644)  # every user that may open the port can check it, with any umask
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         os.write(descriptor, device.encode())
         beside.replace(marker)

@@ -49,7 +49,7 @@ class TagKind(Enum):
 class TagSpec:
     """One tag: name (``device.tag`` or ``program.variable``), kind, unit, limits, and names for its values.
 
-    The limits are the smallest and largest value that the tag is meant to have; None stands for the limit of its kind. `words`
+    The limits are the smallest and largest value that the tag may have; None stands for the limit of its kind. `words`
     are the names of a program's enumeration, such as a state, and stand for its numbers. `value_names` are the names that a
     device's profile gives to some numbers, which programs and tests use as numbers. A MESSAGE has payloads of at most `max_bytes`
     and keeps the last `depth` of them. Raises `FileInvalid` for a size that makes no sense.

@@ -226,7 +226,7 @@ class OutputWriter:
 
     @property
     def is_idle(self) -> bool:
-        """Return whether `tick` does nothing, whatever the time is, until a command, a device or a value changes."""
+        """Return whether `tick` does nothing at any time until a command, a device or a value changes."""
         return all(map(self._rests, self.outputs))  # as a generator, it takes twice the time
 
     def _rests(self, output: Output) -> bool:

@@ -60,7 +60,7 @@ class _Replacement:
 
 @dataclass(slots=True)
 class OnlineChange:
-    """A change that was prepared: what it does to each program. If `refused`, it cannot be carried out."""
+    """A prepared change with its effects on each program. If `refused`, it cannot be carried out."""
 
     runner: TaskRunner
     changes: list[ProgramChange] = field(default_factory=list)

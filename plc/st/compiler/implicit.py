@@ -74,7 +74,7 @@ def _code(code: str, source: ty.Elementary, sink: ty.Elementary) -> str:
 def as_number(x: Compiling, value: Value, pos: Pos, common: ty.Type | None = None) -> Value:
     """Return a bit string as an unsigned integer and an enumeration as an integer, if the dialect allows it; else `value`.
 
-    `common`: the common type of both operands, to which a literal beside a bit string is converted first.
+    `common`: the common type of both operands, to which a literal is converted first if the other operand is a bit string.
     """
     kind = ty.plain(value.type)
     if not x.env.dialect.vendor:

@@ -178,7 +178,7 @@ class _Layout:
     def _merging(self, leaving: Sequence[t.Transition], end: str | t.Transition | None) -> str | None:
         """Return the step to which most of the alternatives lead, the nearest one first.
 
-        If only one of them leads on, return its step, so that the others are short branches beside the main sequence.
+        If only one of them leads on, return its step, so that the others are short branches at the side of the main sequence.
         """
         reached = [self._distances(map(str.lower, one.targets), end) for one in leaving]
         counts = {step: [each[step] for each in reached if step in each] for each in reached for step in each}

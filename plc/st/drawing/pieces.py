@@ -1,7 +1,7 @@
 """The parts of the drawing of a sequential function chart, in the notation of IEC 61131-3 (6.7): steps, transitions and branches.
 
-Each piece has an axis, the vertical line that joins it to the pieces above and below it. `left` and `right` are its widths beside
-the axis. Sizes are in px.
+Each piece has an axis, the vertical line that joins it to the pieces above and below it. `left` and `right` are its widths
+on both sides of the axis. Sizes are in px.
 """
 
 from __future__ import annotations

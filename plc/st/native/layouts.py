@@ -29,7 +29,7 @@ STANDARD = "T_"
 
 
 class Unsupported(Exception):
-    """A construct that is not translated. Its text says which one."""
+    """A construct that is not translated. Its text names it."""
 
 
 @dataclass(slots=True)

@@ -4,7 +4,7 @@ The file connects steps, transitions, divergences and convergences in the direct
 is found by following these connections from the transition to its sources, and from each step to the transitions that lead to
 it. A jump leads to the step that it names. Alternatives without a priority are tried from left to right.
 
-Blocks, contacts, coils and variables beside the chart are a network in LD or FBD. A condition may be connected to it.
+Blocks, contacts, coils and variables next to the chart are a network in LD or FBD. A condition may be connected to it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _UNSUPPORTED = ("macroStep", "jump", "label", "return", "error", "vendorElement"
 
 @dataclass(frozen=True, slots=True)
 class InlineAction:
-    """An action whose statements stand in an action block. `element` holds its text, `name` is made for it."""
+    """An action whose statements are in an action block. `element` holds its text, `name` is made for it."""
 
     name: str
     element: Element
@@ -34,7 +34,7 @@ class InlineAction:
 
 @dataclass(slots=True)
 class ReadChart:
-    """A chart, and the actions whose statements stand in its action blocks."""
+    """A chart, and the actions whose statements are in its action blocks."""
 
     drawn: Drawn
     inline: list[InlineAction]

@@ -193,7 +193,7 @@ class _Converter:
         self._put(method.end_line, "END_METHOD")
 
     def _property(self, pou: Element, found: Element) -> None:
-        """Write a property, which CODESYS adds in the same way as a method. Its accessors stand in any order."""
+        """Write a property, which CODESYS adds in the same way as a method. Its accessors may be in any order."""
         name, interface = self._name(found), found.find("interface")
         of = f"the property {self._name(pou)}.{name}"
         result = interface.inside("returnType") if interface is not None else []

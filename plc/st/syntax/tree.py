@@ -248,7 +248,7 @@ class Transition:
 class Chart:
     """A sequential function chart, the body of a PROGRAM or FUNCTION_BLOCK, or of its action (IEC 61131-3, 6.7).
 
-    `before` are the statements of the blocks that are drawn beside the chart. Each scan executes them before the transitions.
+    `before` are the statements of the blocks that are drawn next to the chart. Each scan executes them before the transitions.
     """
 
     steps: tuple[Step, ...]

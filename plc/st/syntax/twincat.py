@@ -125,7 +125,7 @@ class _Reader:
         part = self._inside[-1]
         inner = "/".join(self._open[len(self._inside) + 1 :])
         pieces = {"Declaration": part.declaration, "Implementation/ST": part.body}.get(inner)
-        if pieces is not None and (pieces or data.strip()):  # white space before a CDATA section is no part of the text
+        if pieces is not None and (pieces or data.strip()):  # white space before a CDATA section is not text
             pieces.append((*self._place(), data))
 
 

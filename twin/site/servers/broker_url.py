@@ -41,7 +41,7 @@ class BrokerUrl:
 
 
 def parse_broker_url(text: str, expected: str, known: tuple[str, ...] = ()) -> BrokerUrl:
-    """Return the parts of a URL. `known` are the parameters that it may have besides those of TLS.
+    """Return the parts of a URL. `known` are the parameters that it may have in addition to those of TLS.
 
     Raises `UsageError` with `expected` for text that is not such a URL, an unknown parameter, or a password.
     """

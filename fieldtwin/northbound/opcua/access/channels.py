@@ -184,7 +184,7 @@ class _Processor(UaProcessor):  # type: ignore[misc]
             _log.warning("the client at %s is refused (%s): %s", self._address, e.code, e)
             return self._end(getattr(ua.StatusCodes, e.code), "the certificate is refused")
         except Exception as e:
-            # asyncua answers errors of services itself; what is left could not be decrypted, verified or decoded
+            # asyncua answers errors of services itself; the others are messages that could not be decrypted, verified or decoded
             _log.warning("the connection of %s is closed: %s: %s", self._address, type(e).__name__, str(e)[:200])
             return self._end(ua.StatusCodes.BadSecurityChecksFailed, "the message is not valid")
 

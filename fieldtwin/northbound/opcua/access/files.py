@@ -34,8 +34,8 @@ def check_files(server: OpcuaServeConfig, system: str) -> None:
 def create_certificate(security: OpcuaSecurity, uri: str, hosts: Sequence[str], days: int) -> None:
     """Write a new RSA key of 2048 bits, a self-signed certificate for it, and the folder of trusted certificates.
 
-    `hosts` are the DNS names and IP addresses of the server, besides the name of this computer. Raises `FileInvalid` if a file
-    exists already or cannot be written.
+    `hosts` are the DNS names and IP addresses of the server, in addition to the name of this computer. Raises `FileInvalid`
+    if a file exists already or cannot be written.
     """
     from asyncua.crypto.cert_gen import (
         dump_private_key_as_pem,

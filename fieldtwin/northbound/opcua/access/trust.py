@@ -161,7 +161,7 @@ def _vouches(trusted: x509.Certificate, certificate: x509.Certificate, now: date
             or uris_of(trusted)
             or not trusted.not_valid_before_utc <= now <= trusted.not_valid_after_utc
         ):
-            return False  # a certificate with an application URI is that of a client, whatever it states about itself
+            return False  # a certificate with an application URI is that of a client, even if it states something else
         certificate.verify_directly_issued_by(trusted)
     except (x509.ExtensionNotFound, InvalidSignature, ValueError, TypeError):
         return False

@@ -263,7 +263,7 @@ def _holds_values(section: Section, path: str) -> bool:
 def _data_type(section: Section, kept: Section, sections: dict[str, Section], path: str, mended: list[str]) -> str:
     """Return the basic data type of a value as text; a type that is not defined becomes DOMAIN.
 
-    CANFestival's editor defines types of its own: the DefaultValue of ``[A0sub1]`` is the basic data type of its type A0h.
+    CANFestival's editor defines additional types: the DefaultValue of ``[A0sub1]`` is the basic data type of its type A0h.
     """
     if _kind(section, path) == 0x2:
         return _DOMAIN

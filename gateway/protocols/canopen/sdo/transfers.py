@@ -283,7 +283,7 @@ class SdoTransfer(ABC):
         return Failed(error, self.abort_frame(code))
 
     def _toggled(self, data: bytes) -> bool:
-        """Return whether the toggle bit is as expected (7.2.4.3.3, CO-001); if so, expect the opposite bit next."""
+        """Return whether the toggle bit is as expected (7.2.4.3.3, CO-001); if so, expect the inverted bit next."""
         if (data[0] >> 4) & 1 != self._toggle:
             return False
         self._toggle ^= 1

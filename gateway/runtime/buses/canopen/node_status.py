@@ -53,7 +53,7 @@ class NodeStatus:
 
 
 def device_status(node: NodeStatus, bus: str, unstarted: str, now_ns: int) -> DeviceStatus:
-    """Return the status of `node` on `bus` at `now_ns`; `unstarted` says which tags lack a value because it is not started."""
+    """Return the status of `node` on `bus` at `now_ns`; `unstarted` names the tags without a value because it is not started."""
     return DeviceStatus(
         bus=bus,
         address=node.driver.node,

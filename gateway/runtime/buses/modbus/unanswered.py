@@ -9,7 +9,7 @@ from __future__ import annotations
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 
 MOST_UNANSWERED = 5
-"""After this many timeouts in a row a connection is useless."""
+"""After this number of successive timeouts a connection is useless."""
 
 
 class Unanswered:

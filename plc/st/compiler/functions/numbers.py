@@ -176,7 +176,7 @@ def _most(name: str, kind: ty.AnyInt, count: Value) -> int | None:
 
 
 def _warn_of_width(x: Compiling, pos: t.Pos, what: str, kind: ty.AnyInt, made: ty.Elementary, most: int | None) -> None:
-    """Warn of a constant that CODESYS may shift with fewer bits: its manuals name the narrowest type, whatever the target is."""
+    """Warn of a constant that CODESYS may shift with fewer bits: its manuals name the narrowest type, for any target."""
     narrow = _narrowest(kind)
     if most is None or not narrow.low <= most <= narrow.high:
         other = f" here, and may have {narrow.bits} on a controller" if narrow.bits < made.bits else ""

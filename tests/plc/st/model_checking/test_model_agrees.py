@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from example_programs import CODESYS, EXAMPLES
+from example_programs import CODESYS, EXAMPLES, MAIL_COUNTED_MODULO
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from model_bench import INTERVAL_NS, kept, model_of, model_states, program_states, same
@@ -114,6 +114,12 @@ def test_model_and_program_agree(name: str) -> None:
 
 def test_model_and_program_agree_in_the_dialect_codesys() -> None:
     check_many(*model_of(CODESYS, dialect="codesys"), 12)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(300)
+def test_model_and_program_agree_where_the_solver_finds_no_answer_in_time() -> None:
+    check_many(*model_of(MAIL_COUNTED_MODULO), 12)
 
 
 @pytest.mark.long

@@ -75,6 +75,7 @@ def load_program(
     *,
     takes_writes: bool = False,
     machine_code: bool = False,
+    published: Sequence[str] = (),
 ) -> Program:
     """Create the program that `source` names, searching the folders of `python_path` first. Raises `FileInvalid`.
 
@@ -85,7 +86,8 @@ def load_program(
     folder of such files (``plc``), followed by ``:NAME`` if there are several programs. `dialect` is the dialect of a text
     (`fieldtwin.plc.st.dialects`), and `libraries` are files or folders with declarations that it uses, searched like `source`.
     `takes_writes`: a program in Structured Text has a message input for writes of servers (`fieldtwin.plc.st.program.WRITES`).
-    `machine_code`: a program in Structured Text is compiled to machine code (`fieldtwin.plc.st.native`).
+    `machine_code`: a program in Structured Text is compiled to machine code (`fieldtwin.plc.st.native`). `published`: paths of
+    members and elements of its variables that get tags, too.
     """
     language, _, rest = source.partition(":")
     made: Callable[[], Program]
@@ -93,7 +95,13 @@ def load_program(
         made = _python_class(source, rest, python_path)
     else:
         found = _text_class(
-            source, python_path, dialect, libraries, takes_writes=takes_writes, machine_code=machine_code
+            source,
+            python_path,
+            dialect,
+            libraries,
+            takes_writes=takes_writes,
+            machine_code=machine_code,
+            published=published,
         )
         made = partial(found, together)
     return _created(source, made)
@@ -156,6 +164,7 @@ def _text_class(
     *,
     takes_writes: bool,
     machine_code: bool,
+    published: Sequence[str],
 ) -> type[StProgram]:
     found = text_source(source, folders)
     if found is None:
@@ -164,7 +173,14 @@ def _text_class(
     from fieldtwin.plc.st.program import load_source  # load the compiler only if there is something to compile
 
     places = library_places(libraries, folders)
-    return load_source(*found, dialect_of(dialect), places, takes_writes=takes_writes, machine_code=machine_code)
+    return load_source(
+        *found,
+        dialect_of(dialect),
+        places,
+        takes_writes=takes_writes,
+        machine_code=machine_code,
+        published=published,
+    )
 
 
 def library_places(libraries: Sequence[str], folders: Sequence[str]) -> tuple[Path, ...]:

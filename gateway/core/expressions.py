@@ -85,14 +85,16 @@ class NotUnderstood(UsageError):
 
 
 class Parsed:
-    """The syntax tree of a text, which contains only nodes of this language. `what` names the text in errors: "formula".
+    """The syntax tree of a text, which contains only nodes of this language. `what` names the text in errors: "formula". With
+    `indices` names may contain indices of arrays, such as ``tank.levels[3]``.
 
     `times_s` are the times that it contains, in seconds. Raises `UsageError` for an invalid text, with `hint` for one
     that Python's parser refuses.
     """
 
-    def __init__(self, text: str, what: str, hint: str) -> None:
+    def __init__(self, text: str, what: str, hint: str, *, indices: bool = False) -> None:
         self.text = text
+        self._indices = indices
         self.times_s = [float(m[2]) * _UNIT_S[m[3]] for m in _TOKEN.finditer(text) if m[2] is not None]
         self._what = what
         if len(text) > LONGEST:
@@ -137,6 +139,9 @@ class Parsed:
             case ast.Name() | ast.Attribute():
                 self._check_name(node)
                 parts = []
+            case ast.Subscript() if self._indices:
+                self._check_name(node)
+                parts = []
             case ast.Call(func=name, args=parts, keywords=[]):
                 self._check_name(name)
             case ast.BoolOp(values=parts):
@@ -157,7 +162,11 @@ class Parsed:
 
     def _check_name(self, node: ast.expr) -> None:
         inner = node
-        while isinstance(inner, ast.Attribute):
+        while isinstance(inner, ast.Attribute | ast.Subscript):
+            if isinstance(inner, ast.Subscript) and not (self._indices and _index(inner.slice)):
+                raise self.error(
+                    "not the index of an array", inner.slice, expected="a number, such as levels[3] or map[1, 2]"
+                )
             inner = inner.value
         if not isinstance(inner, ast.Name):
             raise self.error("not a name", node, got=ast.unparse(inner))
@@ -167,7 +176,21 @@ def dotted(node: ast.expr) -> str:
     """Return the name that a node of a `Parsed` tree represents, such as ``ctd.pressure``; "" for any other node."""
     if isinstance(node, ast.Attribute):
         return f"{dotted(node.value)}.{node.attr}"
+    if isinstance(node, ast.Subscript):
+        return f"{dotted(node.value)}[{_index(node.slice)}]"
     return node.id if isinstance(node, ast.Name) else ""
+
+
+def _index(node: ast.expr) -> str:
+    """Return the indices of an array as they are written in paths, such as ``3`` or ``1,-2``; "" for other expressions."""
+    numbers = []
+    for one in node.elts if isinstance(node, ast.Tuple) else [node]:
+        negative = isinstance(one, ast.UnaryOp) and isinstance(one.op, ast.USub)
+        number = one.operand if isinstance(one, ast.UnaryOp) and negative else one
+        if not (isinstance(number, ast.Constant) and type(number.value) is int):
+            return ""
+        numbers.append(f"{'-' if negative else ''}{number.value}")
+    return ",".join(numbers)
 
 
 def _plain(match: re.Match[str]) -> str:

@@ -23,7 +23,8 @@ class ProgramConfig:
 
     It holds its source (`fieldtwin.plc.binding.load_program`), its bindings from variable to tag, its task (the first task if
     empty), its policy while it waits for its inputs, and the dialect and the libraries of its source. With `takes_writes`,
-    servers write its variables; with `machine_code`, it is compiled to machine code.
+    servers write its variables; with `machine_code`, it is compiled to machine code. `published` are paths of members and
+    elements of its variables, such as ``timer.Q``, that alarms use and that therefore have tags.
     """
 
     name: str
@@ -36,6 +37,7 @@ class ProgramConfig:
     libraries: tuple[str, ...] = ()
     takes_writes: bool = False
     machine_code: bool = False
+    published: tuple[str, ...] = ()
 
     def bind(self, python_path: tuple[str, ...] = (), together: dict[Any, Any] | None = None) -> BoundProgram:
         """Create the program (`fieldtwin.plc.binding.load_program`). Raises `FileInvalid`."""
@@ -47,6 +49,7 @@ class ProgramConfig:
             self.libraries,
             takes_writes=self.takes_writes,
             machine_code=self.machine_code,
+            published=self.published,
         )
         return BoundProgram(self.name, program, self.inputs, self.outputs)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import islice, product
 from typing import Any
 
@@ -18,6 +19,7 @@ from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.classes.instance_variables import is_instance_variable, own_name, shown_name
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
+from fieldtwin.plc.st.runtime.parts import Key
 
 SHOWN_ELEMENTS = 6
 """How many elements of an array are shown in one text."""
@@ -31,6 +33,20 @@ _DATES: dict[str, Callable[[int], str]] = {
 
 Typed = tuple[ty.Type, Any]
 """A type and a value of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a variable is: its `path` as declared, the attributes and elements that lead to it from the program, and its type."""
+
+    path: str
+    keys: tuple[Key, ...]
+    kind: ty.Type
+
+
+def code_of(keys: Sequence[Key]) -> str:
+    """Return the Python code of attributes and elements, such as ``.v_levels[2]``."""
+    return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
 
 
 class Inspection:
@@ -106,32 +122,55 @@ class Inspection:
 
     def code(self, path: str) -> tuple[str, ty.Type] | None:
         """Return the Python attributes and indices of a path, such as ``v_levels[2]``, and its type; None for an unknown path."""
-        name, rest = self.first(path)
-        top = next((found for found in self._variables if found[0].lower() == name.lower()), None)
-        return self.code_within(f"v_{own_name(name).lower()}", top[1], rest) if top is not None else None
+        found = self.place(path)
+        return (code_of(found.keys).removeprefix("."), found.kind) if found is not None else None
 
     def code_within(self, code: str, kind: ty.Type, rest: str) -> tuple[str, ty.Type] | None:
         """Return the Python code and the type of a part of a variable, whose own `code` and `kind` are given, as `code`
         does.
         """
+        found = self.place_within(Place("", (), kind), rest)
+        return (f"{code}{code_of(found.keys)}", found.kind) if found is not None else None
+
+    def place(self, path: str) -> Place | None:
+        """Return the place of a variable of the program; None for an unknown path."""
+        name, rest = self.first(path)
+        top = next((found for found in self._variables if found[0].lower() == name.lower()), None)
+        if top is None:
+            return None
+        return self.place_within(Place(top[0], (f"v_{own_name(top[0]).lower()}",), top[1]), rest)
+
+    def place_within(self, found: Place, rest: str) -> Place | None:
+        """Return the place of a part of the variable `found`, such as ``.ET`` or ``[3]``; None for an unknown part."""
         at = 0
         while at < len(rest):
             step = _STEP.match(rest, at)
             if step is None:
                 return None
+            kind = found.kind
             named, at = self._with_method(kind, step, rest)
             if named:
                 member = self.member_attribute(kind, named)
                 if member is None:
                     return None
-                code, kind = f"{code}.{member[0]}", member[1]
+                found = Place(f"{found.path}.{self._declared_member(kind, named)}", (*found.keys, member[0]), member[1])
             else:
                 indices = _indices(kind, step[2])
                 if not isinstance(kind, ty.Array) or not indices:
                     return None
-                code += "".join(f"[{i - low}]" for i, (low, _) in zip(indices, kind.ranges, strict=True))
-                kind = kind.of
-        return code, kind
+                keys = (i - low for i, (low, _) in zip(indices, kind.ranges, strict=True))
+                index = ",".join(map(str, indices))
+                found = Place(f"{found.path}[{index}]", (*found.keys, *keys), kind.of)
+        return found
+
+    def _declared_member(self, kind: ty.Type, member: str) -> str:
+        """Return the name of a member as it is declared."""
+        if isinstance(kind, ty.Struct):
+            return kind.fields[member.lower()][0]
+        if isinstance(kind, ty.Block) and kind.standard is not None:
+            return {**kind.inputs, **kind.outputs}[member.lower()][0]
+        assert isinstance(kind, ty.Block)
+        return next(name for name, _ in self._blocks[kind.name.lower()] if name.lower() == member.lower())
 
     def member_attribute(self, kind: ty.Type, member: str) -> tuple[str, ty.Type] | None:
         """Return the attribute of a member of a structure or block, and its type; None for others."""

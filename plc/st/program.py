@@ -9,7 +9,7 @@ their two's complement.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MethodType
@@ -394,12 +394,14 @@ def program_class(
     pictures: Pictures | None = None,
     *,
     takes_writes: bool = False,
+    published: Sequence[str] = (),
 ) -> type[StProgram]:
     """Return the class of program `name` of a unit, or of its only program if `name` is empty. Raises `FileInvalid`.
 
     `name` may also be that of a program of a configuration, which states the PROGRAM. With `takes_writes` the program has a
-    message input whose messages set its variables, each before the next scan. `decisions` and `pictures` are those of the unit
-    and of the program, if they are known already; the `source` of the unit is not used then.
+    message input whose messages set its variables, each before the next scan. The paths in `published`, such as ``timer.Q``, get
+    tags; those that the program does not have, and those of values that cannot be tags, are left out. `decisions` and `pictures`
+    are those of the unit and of the program, if they are known already; the `source` of the unit is not used then.
     """
     missing = {m.name: m for m in unit.missing if m.kind == "program"}
     names = [*(p.name for p in unit.programs if p.declared_name == p.name), *missing]
@@ -423,6 +425,7 @@ def program_class(
         why = "connect the variables" if connecting else "have different values for variables"
         message = f"which program of the configuration is meant, because they {why} of {found.name}"
         raise FileInvalid(message, path=unit.path, expected=", ".join(one.name for one in special), hint=hint)
+    found = _with_published(unit, found, published)
     connected = instance.connected if instance is not None else frozenset()
     tags = {v.name: made for v in found.variables if (made := _tag_of(v, connected)) is not None}
     if takes_writes:
@@ -437,6 +440,18 @@ def program_class(
     named = instance.name if instance is not None and connected else ""
     internal = frozenset(v.name for v in found.variables if is_instance_variable(v.name))
     return _class_of(unit, found, decided, tags, internal, named, pictures)
+
+
+def _with_published(unit: CompiledUnit, program: CompiledProgram, paths: Sequence[str]) -> CompiledProgram:
+    """Return `program` with these parts of its variables, and of global variables, as local variables."""
+    known = {v.name for v in program.variables}
+    found = []
+    for path in (path for path in dict.fromkeys(paths) if path not in known):
+        place = VariablePaths(unit, program, ()).place(path)
+        if place is not None and place[0].path == path and _tag_kind(place[0].kind) not in (None, TagKind.MESSAGE):
+            *steps, last = place[0].keys
+            found.append(ProgramVariable(path, "local", place[0].kind, False, last, place[1], steps=tuple(steps)))
+    return replace(program, variables=(*program.variables, *found)) if found else program
 
 
 def with_interface(made: type[StProgram], interface: Mapping[str, Variable]) -> type[StProgram]:
@@ -547,17 +562,19 @@ def load_source(
     *,
     takes_writes: bool = False,
     machine_code: bool = False,
+    published: Sequence[str] = (),
 ) -> type[StProgram]:
     """Read and compile a file (Structured Text, or a PLCopen XML export) or a folder of them. Raises `FileInvalid`.
 
-    It has probes for coverage if a recording is active. Otherwise `machine_code` gives it machine code.
+    It has probes for coverage if a recording is active. Otherwise `machine_code` gives it machine code. `published`: as in
+    `program_class`.
     """
     recording = active_recording()
     if recording is not None:
         unit = recording.compiled(path, dialect, libraries)
     else:
         unit = compile_source(path, dialect, libraries, machine_code=machine_code)
-    return program_class(unit, name, takes_writes=takes_writes)
+    return program_class(unit, name, takes_writes=takes_writes, published=published)
 
 
 def _tag_kind(kind: ty.Type) -> TagKind | None:

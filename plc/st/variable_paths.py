@@ -14,7 +14,7 @@ from fieldtwin.plc.st.classes.instance_variables import shown_name
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.pous.programs import CompiledProgram, ProgramVariable
 from fieldtwin.plc.st.compiler.pous.variables import GlobalVariable
-from fieldtwin.plc.st.inspection import Inspection, Typed, first_name, shown_value
+from fieldtwin.plc.st.inspection import Inspection, Place, Typed, code_of, first_name, shown_value
 
 Read = Callable[[Any, Any], Any]
 """Reads a variable from the object of the program and that of the global variables."""
@@ -50,10 +50,12 @@ class VariablePaths:
 
     def reading(self, path: str) -> tuple[ty.Type, Read] | None:
         """Return the type of a variable, also of one that is a tag, and what reads it; None for a path as in `internal`."""
-        found = self._code(path)
-        if found is None or isinstance(found[1], ty.Struct | ty.Block | ty.MessagesIn | ty.MessagesOut):
+        found = self.place(path)
+        if found is None or isinstance(found[0].kind, ty.Struct | ty.Block | ty.MessagesIn | ty.MessagesOut):
             return None
-        return found[1], eval(f"lambda body, shared: {found[0]}")  # safe: names of declarations, and numbers
+        owner = "shared" if found[1] else "body"
+        code = f"lambda body, shared: {owner}{code_of(found[0].keys)}"  # names of declarations, and numbers
+        return found[0].kind, eval(code)
 
     def typed(self, path: str, body: Any, shared: Any) -> Typed | None:
         """Return the type and the value of any variable, also of a structure or block; None for a path that names none."""
@@ -70,20 +72,24 @@ class VariablePaths:
         """Return the part of a variable that the `rest` of a path selects, such as ``.ET``; None for any other."""
         return self._every.within(found, rest)
 
-    def _code(self, path: str) -> tuple[str, ty.Type] | None:
+    def place(self, path: str) -> tuple[Place, bool] | None:
+        """Return the place of any variable, and whether it is a global one or a part of one; None for an unknown path."""
         name, rest = first_name(path)
         shared = self._shared.get(name.lower())
         if shared is not None:
-            return self._every.code_within(f"shared.{shared.attribute}", shared.kind, rest)
-        own = self._every.code(path)
+            top = Place(shared.name, (shared.attribute,), shared.kind)
+            return _with(self._every.place_within(top, rest), shared=True)
+        own = self._every.place(path)
         if own is not None:
-            return f"body.{own[0]}", own[1]
+            return own, False
         found = self._global(path)
-        return (
-            self._every.code_within(f"shared.{found[0].attribute}", found[0].kind, found[1])
-            if found is not None
-            else None
-        )
+        if found is None:
+            return None
+        of, rest = found
+        of_list = next((shown for shown, one in self._globals.values() if one is of), of.name)
+        declared = of_list if len(of_list) == len(path) - len(rest) else of.name
+        top = Place(declared, (of.attribute,), of.kind)
+        return _with(self._every.place_within(top, rest), shared=True)
 
     def _global(self, path: str) -> tuple[GlobalVariable, str] | None:
         """Return the global variable with which a path begins, and the rest of the path."""
@@ -98,6 +104,10 @@ class VariablePaths:
         """Return the variable with this name if exactly one list has it."""
         found = [one for key, one in self._globals.items() if key.rpartition(".")[2] == name]
         return found[0] if len(found) == 1 else None
+
+
+def _with(place: Place | None, *, shared: bool) -> tuple[Place, bool] | None:
+    return (place, shared) if place is not None else None
 
 
 def _globals_of(unit: CompiledUnit, program: CompiledProgram) -> dict[str, tuple[str, GlobalVariable]]:

@@ -200,6 +200,11 @@ def test_an_acknowledgement_that_makes_no_sense_is_an_error(tmp_path: Path) -> N
         ("  - acknowledge: alarm.hihg\n", "no alarm 'alarm.hihg'"),
         ("  - expect: {tag: alarm.high, value: aktive}\n", "no value of alarm.high 'aktive'"),
         ("  - expect: {that: \"alarm.low == 'normal'\"}\n", "no tag or variable 'alarm.low'"),
+        ("  - expect: {tag: alarm.hihg, value: normal}\n", "no tag 'alarm.hihg'.*did you mean 'alarm.high'"),
+        ("  - wait: {until: \"alarm.low == 'normal'\"}\n", "no tag or variable 'alarm.low'"),
+        ("  - expect: {tag: alarm.high, value: 1}\n", "the state of alarm.high; expected normal, active_.*; got 1"),
+        ("  - set: {tag: alarm.high, value: normal}\n", "'alarm.high' is an alarm, which cannot be set"),
+        ("  - pause: 1s\nrefused: [alarm.high]\n", "'alarm.high' is an alarm, which cannot be written"),
     ],
 )
 def test_unknown_alarms_and_states_in_scenarios(tmp_path: Path, steps: str, expected: str) -> None:

@@ -36,6 +36,7 @@ from fieldtwin.plc.binding import BoundProgram, InputBinding, check_kind, image_
 from fieldtwin.plc.cycle.start import StartPolicy
 from fieldtwin.plc.program import Role, Variable
 from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig, TaskSpec
+from fieldtwin.twin.plant.alarm_members import members_in_alarms
 from fieldtwin.twin.plant.alarms import load_alarms
 from fieldtwin.twin.plant.variable_users import variable_users
 from fieldtwin.twin.site.schema import StartForm
@@ -100,7 +101,7 @@ def plant_tags(system: System) -> dict[str, TagSpec]:
 
 def programs_of(system: System) -> tuple[ProgramConfig, ...]:
     """Return the configuration of the PLC's programs for its process."""
-    written = _written_programs(system)
+    written, members = _written_programs(system), members_in_alarms(system)
     return tuple(
         ProgramConfig(
             name,
@@ -114,6 +115,7 @@ def programs_of(system: System) -> tuple[ProgramConfig, ...]:
             tuple(form.libraries),
             takes_writes=name in written,
             machine_code=form.machine_code,
+            published=members.get(name, ()),
         )
         for name, form in system.plc.programs.items()
     )

@@ -153,6 +153,7 @@ def _resolve(
     for n, tag in enumerate(form.refused):
         with errors.collect():
             _known(file, ("refused", n), "tag", tag, scenario.own, incomplete)
+            _refuse_alarm(scenario, tag, ("refused", n), "written", "a tag that a program writes")
             scenario.used.add(tag)
     faults: list[str] = []
     for n, step in enumerate(form.steps):
@@ -269,6 +270,7 @@ def _check_step(scenario: Scenario, step: Step, n: int) -> None:
 
 def _check_set(scenario: Scenario, said: Set, loc: tuple[Key, ...]) -> None:
     _known(scenario.file, (*loc, "tag"), "tag", said.tag, scenario.own, scenario.incomplete)
+    _refuse_alarm(scenario, said.tag, (*loc, "tag"), "set", "a tag that the condition of the alarm uses")
     device, _, name = said.tag.rpartition(".")
     found = scenario.system.devices.get(device)
     if found is None or name not in found.profile.tags or said.value is None:
@@ -280,6 +282,11 @@ def _check_set(scenario: Scenario, said: Set, loc: tuple[Key, ...]) -> None:
         raise scenario.file.error(
             (*loc, "value"), f"{said.tag} is {wanted}", expected=", ".join(names), got=repr(said.value), hint=hint
         )
+
+
+def _refuse_alarm(scenario: Scenario, name: str, loc: tuple[Key, ...], what: str, expected: str) -> None:
+    if scenario.words.get(name) is ALARM_STATES:
+        raise scenario.file.error(loc, f"{name!r} is an alarm, which cannot be {what}", expected=expected)
 
 
 def _aim(scenario: Scenario, spec: FaultSpec) -> None:
@@ -322,6 +329,9 @@ def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> N
     if expect.tag is not None:
         _known(scenario.file, (*loc, "tag"), "tag", expect.tag, scenario.known, scenario.incomplete)
         words = scenario.words.get(expect.tag, ())
+        if words is ALARM_STATES and expect.value is not None and not isinstance(expect.value, str):
+            expected, got = ", ".join(ALARM_STATES), repr(expect.value)
+            raise scenario.file.error((*loc, "value"), f"the state of {expect.tag}", expected=expected, got=got)
         if words and isinstance(expect.value, str):
             _known(scenario.file, (*loc, "value"), f"value of {expect.tag}", expect.value, tuple(words))
         elif isinstance(words, Mapping) and isinstance(expect.value, str):

@@ -12,6 +12,7 @@ from math import isnan
 from typing import Any
 
 from fieldtwin.gateway.core.conditions.decimals import as_decimal
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.expressions import ARITHMETIC, COMPARE, OF_NUMBERS, NotUnderstood, Parsed, dotted
 from fieldtwin.gateway.core.files.nearest import did_you_mean
 from fieldtwin.gateway.core.values import Quality, Reason
@@ -32,6 +33,29 @@ Look = Callable[[str, str], Any]
 """``look(function, name)`` returns the current value of a function of a tag or variable, or None if it is unknown."""
 
 
+def parsed(text: str) -> Parsed:
+    """Return the syntax tree of a condition. Raises `UsageError` for an invalid text."""
+    return Parsed(text, "expression", "for example: relay.state == 'ACTIVE'", indices=True)
+
+
+def names_in_text(text: str) -> list[str]:
+    """Return the tags and variables in a condition, without knowing which exist; an empty list for an invalid condition."""
+    try:
+        found = parsed(text)
+    except UsageError:
+        return []
+    names, waiting = [], [found.tree]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.Name | ast.Attribute | ast.Subscript):
+            names.append(dotted(node))
+        elif isinstance(node, ast.Call):
+            waiting += node.args
+        else:
+            waiting += [part for part in ast.iter_child_nodes(node) if isinstance(part, ast.expr)]
+    return names
+
+
 class UnknownName(NotUnderstood):
     """An expression contains a `name` that the system does not have. `others` are the errors of its further unknown names."""
 
@@ -47,7 +71,7 @@ class Expression:
 
     `words` gives, for some names, the texts that they can equal; comparing such a name with a different text is an
     error. A text for which `words` has a number is replaced by that number. `prefix` is put before each name when it is
-    evaluated: in a network, the name of the system and a dot.
+    evaluated: in a network, the name of the system and a dot. An error for an unknown name suggests one of `known` and `near`.
     """
 
     def __init__(
@@ -56,10 +80,11 @@ class Expression:
         known: Collection[str],
         words: Mapping[str, Words] = NO_WORDS,
         prefix: str = "",
+        near: Collection[str] = (),
     ) -> None:
         self.text = text
         self.names: list[str] = []
-        self._parsed = Parsed(text, "expression", "for example: relay.state == 'ACTIVE'")
+        self._parsed = parsed(text)
         self._tree = self._parsed.tree
         self.times_s = self._parsed.times_s
         """The times that the expression contains, in seconds."""
@@ -67,7 +92,7 @@ class Expression:
         """Whether the expression contains ``plc.late``."""
         self.asks: set[str] = set()
         """The functions of tags in the expression, and ``plc.late`` and ``command_pending`` if it contains them."""
-        self._known = known
+        self._known, self._near = known, near
         self._words = words
         self._prefix = prefix
         self._unknown: list[UnknownName] = []
@@ -101,7 +126,7 @@ class Expression:
         if isinstance(node, ast.Call):
             self._check_call(node)
             return
-        if isinstance(node, ast.Name | ast.Attribute):
+        if isinstance(node, ast.Name | ast.Attribute | ast.Subscript):
             self._check_name(node)
             return
         if isinstance(node, ast.Compare):
@@ -135,10 +160,10 @@ class Expression:
         if not isinstance(text, ast.Constant) or not isinstance(text.value, str):
             return
         words: Words = ()
-        if isinstance(asked, ast.Name | ast.Attribute):
+        if isinstance(asked, ast.Name | ast.Attribute | ast.Subscript):
             words = self._words.get(dotted(asked), ())
         elif isinstance(asked, ast.Call) and isinstance(asked.func, ast.Name) and len(asked.args) == 1:
-            value = asked.func.id == "value" and isinstance(asked.args[0], ast.Name | ast.Attribute)
+            value = asked.func.id == "value" and isinstance(asked.args[0], ast.Name | ast.Attribute | ast.Subscript)
             words = self._words.get(dotted(asked.args[0]), ()) if value else WORDS.get(asked.func.id, ())
         if isinstance(words, Mapping) and text.value in words:
             text.value = words[text.value]
@@ -161,7 +186,7 @@ class Expression:
             self.asks |= {name} & set(_OWN)
             return
         if name not in self._known:
-            hint = did_you_mean(name, self._known)
+            hint = did_you_mean(name, [*self._known, *self._near])
             expected = "DEVICE.TAG or PROGRAM.VARIABLE"
             error = self._parsed.error(f"no tag or variable {name!r}", node, expected=expected, hint=hint)
             self._unknown.append(UnknownName(name, error))
@@ -171,7 +196,7 @@ class Expression:
 def _value(node: ast.expr, look: Look) -> Any:
     if isinstance(node, ast.Constant):
         return node.value
-    if isinstance(node, ast.Name | ast.Attribute):
+    if isinstance(node, ast.Name | ast.Attribute | ast.Subscript):
         name = dotted(node)
         return name == "true" if name in ("true", "false") else _known(as_decimal(look("value", name)))
     if isinstance(node, ast.Call):

@@ -21,13 +21,15 @@ def read_expression(
     *,
     prefix: str = "",
     incomplete: Container[str] = frozenset(),
+    near: Collection[str] = (),
 ) -> Expression:
-    """Return `text`, which is at `loc` in `file`, as an expression. `known`, `words` and `prefix` are those of `Expression`.
+    """Return `text`, which is at `loc` in `file`, as an expression. `known`, `words`, `prefix` and `near` are those of
+    `Expression`.
 
     `incomplete` are devices and programs that have errors, so that names in them cannot be checked. Raises `FileInvalid`.
     """
     try:
-        return Expression(text, known, words, prefix)
+        return Expression(text, known, words, prefix, near)
     except UnknownName as e:
         errors = ErrorCollector()
         for one in (e, *e.others):

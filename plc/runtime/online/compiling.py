@@ -60,7 +60,7 @@ def compile_programs(request: CompileRequest) -> dict[str, Version]:
     found = {}
     for config in request.programs:
         unit, name, digests = _compiled(config, request.python_path)
-        found[config.name] = _version(config.name, program_class(unit, name, takes_writes=config.takes_writes), digests)
+        found[config.name] = _version(config.name, _class_of(config, unit, name), digests)
     return found
 
 
@@ -87,7 +87,7 @@ def compile_elsewhere(request: CompileRequest) -> dict[str, Version]:
         at, name, digests = result.programs[config.name]
         unit, decisions = units[at]
         pictures = Pictures(_joined(result.drawings[config.name]), result.machines[config.name])
-        made = program_class(unit, name, decisions, pictures, takes_writes=config.takes_writes)
+        made = _class_of(config, unit, name, decisions, pictures)
         found[config.name] = _version(config.name, made, digests)
         make_way()
     return found
@@ -104,6 +104,16 @@ def _compiled(config: ProgramConfig, folders: Sequence[str]) -> tuple[CompiledUn
     digests = {str(file): digest_of(str(file)) for place in (path, *libraries) for file in source_files(place)}
     unit = compile_source(path, dialect_of(config.dialect), libraries, machine_code=config.machine_code)
     return unit, name, digests
+
+
+def _class_of(
+    config: ProgramConfig,
+    unit: CompiledUnit,
+    name: str,
+    decisions: Decisions | None = None,
+    pictures: Pictures | None = None,
+) -> type[StProgram]:
+    return program_class(unit, name, decisions, pictures, takes_writes=config.takes_writes, published=config.published)
 
 
 def _version(name: str, made: type[StProgram], digests: Mapping[str, str]) -> Version:

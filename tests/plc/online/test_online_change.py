@@ -420,6 +420,20 @@ def test_a_variable_that_the_system_file_uses_stays(tmp_path: Path, users: list[
     assert plc.outputs()["control.n"] == 9 + 2
 
 
+def test_a_member_that_an_alarm_uses_stays_and_keeps_its_tag(tmp_path: Path) -> None:
+    members = ("meters[1].scans", "delay.Q", "at.x")
+    users = {"control.meters[1].scans": ["alarm high"]}
+    plc = Plc(tmp_path, programs=(program("control", published=members),), users=users)
+    plc.until(50)
+    assert (plc.outputs()["control.at.x"], plc.outputs()["control.delay.Q"]) == (5, False)
+    assert plc.refused(edited(("ARRAY[1..2] OF Meter", "ARRAY[2..3] OF Meter"), ("meters[1]", "meters[3]"))) == (
+        "local meters[1].scans is removed, but alarm high uses it: keep it, or change alarm high as well and restart the run"
+    )
+    plc.change(edited(("n := n + 1;", "n := n + 100;")))
+    plc.until(80)
+    assert plc.outputs()["control.at.x"] == plc.outputs()["control.n"] > 200
+
+
 def test_programs_of_one_file_continue_with_one_set_of_global_variables(tmp_path: Path) -> None:
     second = "PROGRAM Second VAR_OUTPUT seen : INT; END_VAR seen := total; END_PROGRAM\n"
     first = program("control", "control.st:Control")

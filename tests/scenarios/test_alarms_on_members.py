@@ -13,6 +13,7 @@ from fieldtwin.results.trace import TraceKind
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.language.form import load_scenario
 from fieldtwin.twin.plant.physical import alarms_of, image_layout, programs_of
+from fieldtwin.twin.plant.variable_users import variable_users
 from fieldtwin.twin.site.system import System, load_system
 
 PROGRAM = """TYPE Mode : (idle, run, fault) := idle; Level : STRUCT now : REAL; high : BOOL; END_STRUCT END_TYPE
@@ -91,6 +92,12 @@ def test_the_members_in_alarms_are_tags_also_of_scenarios(tmp_path: Path) -> Non
     steps = '  - wait: {until: "control.c.levels[2] >= 20 and control.c.state == 2", within: 2s}\n'
     result = run(tmp_path, steps + '  - expect: {tag: "control.c.levels[2]", value: 30, tolerance: 10}\n')
     assert result.verdict is Verdict.PASSED, result.checks[-1]
+
+
+def test_an_online_change_knows_the_alarms_that_use_a_member(tmp_path: Path) -> None:
+    users = variable_users(system_of(tmp_path, ALARMS))
+    assert users["control.c.levels[2]"] == ["alarm element"]
+    assert users["control.more[2].n"] == users["control.more[2].delay.Q"] == ["alarm of_array"]
 
 
 def test_without_members_in_alarms_a_program_has_no_more_tags(tmp_path: Path) -> None:

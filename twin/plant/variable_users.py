@@ -6,10 +6,7 @@ of programs are not listed here, because the PLC knows them. This module reads n
 
 from __future__ import annotations
 
-import ast
-
-from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.gateway.core.expressions import Parsed, dotted
+from fieldtwin.gateway.core.conditions.expression import names_in_text
 from fieldtwin.twin.site.system import System
 
 
@@ -18,8 +15,8 @@ def variable_users(system: System) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
 
     def note(user: str, *texts: str) -> None:
-        for name in dict.fromkeys(name for text in texts for name in _names(text)):
-            if name.partition(".")[0] in system.plc.programs:
+        for name in dict.fromkeys(name for text in texts for name in names_in_text(text)):
+            if "." in name and name.partition(".")[0] in system.plc.programs:
                 found.setdefault(name, []).append(user)
 
     for alarm, form in system.alarms.items():
@@ -34,12 +31,3 @@ def variable_users(system: System) -> dict[str, list[str]]:
             if tag.from_plc:
                 found.setdefault(tag.tag, []).append(f"server {server.name}")
     return found
-
-
-def _names(text: str) -> list[str]:
-    """Return the dotted names in a condition; none for an invalid one, which is an error elsewhere."""
-    try:
-        tree = Parsed(text, "expression", "a condition").tree
-    except UsageError:
-        return []
-    return [dotted(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute)]

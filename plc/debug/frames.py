@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from types import CodeType
 from typing import Any
@@ -23,9 +23,13 @@ Assign = Callable[[Any], None]
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """A variable, or a part of one, of a stopped program. `assign` gives it a new value; None if it cannot have one."""
+    """A variable, or a part of one, of a stopped program. `assign` gives it a new value; None if it cannot have one.
+
+    `path` is an expression for it in the source, such as ``timer.ET`` or ``levels[3]``.
+    """
 
     name: str
+    path: str
     type: ty.Type
     value: Any
     assign: Assign | None = field(default=None, compare=False)
@@ -84,12 +88,14 @@ class Units:
             return []
         if isinstance(kind, ty.Array):
             return [
-                Variable(index, kind.of, one, inspection.assigning((kind, value), index))
+                Variable(index, f"{variable.path}{index}", kind.of, one, inspection.assigning((kind, value), index))
                 for index, one in islice(elements(kind, value), MAX_ELEMENTS)
             ]
         if isinstance(kind, ty.Struct | ty.Block):
             return [
-                Variable(name, of, inside, inspection.assigning((kind, value), f".{name}"))
+                Variable(
+                    name, f"{variable.path}.{name}", of, inside, inspection.assigning((kind, value), f".{name}")
+                )
                 for name, of, inside in inspection.members(kind, value)
             ]
         return []
@@ -107,7 +113,7 @@ class Units:
         owner = inspection.within((top.type, top.value), before) if step else None
         if found is None or owner is None:
             return None
-        return Variable(path, *found, inspection.assigning(owner, step))
+        return Variable(path, path, *found, inspection.assigning(owner, step))
 
     def evaluate(self, text: str, frame: StoppedFrame) -> Variable:
         """Return the variable with the path `text`, else the value of the expression `text`. Raises `UsageError`."""
@@ -115,7 +121,7 @@ class Units:
         if found is not None:
             return found
         expression = self.expression(frame.code, text)
-        return Variable(text, expression.type, expression.value(frame.space, frame.local))
+        return Variable(text, text, expression.type, expression.value(frame.space, frame.local))
 
     def assign(self, variable: Variable, text: str, frame: StoppedFrame) -> Variable:
         """Give a variable the value of the expression `text`, and return it with that value. Raises `UsageError`."""
@@ -125,7 +131,7 @@ class Units:
             raise UsageError(f"{variable.name} cannot be set here")
         value = self.expression(frame.code, text, variable.type).value(frame.space, frame.local)
         variable.assign(value)
-        return Variable(variable.name, variable.type, value, variable.assign)
+        return replace(variable, value=value)
 
     def expression(self, code: CodeType, text: str, wanted: ty.Type | None = None) -> Expression:
         """Compile an expression in the scope of the POU to which code belongs. Raises `UsageError`."""
@@ -150,7 +156,7 @@ def _read(symbol: Symbol, frame: StoppedFrame) -> Iterator[Variable]:
         value = eval(symbol.code, frame.space, frame.local)
     except (NameError, AttributeError):
         return
-    yield Variable(symbol.name, symbol.type, value, _assigning(symbol, frame))
+    yield Variable(symbol.name, symbol.name, symbol.type, value, _assigning(symbol, frame))
 
 
 def _assigning(symbol: Symbol, frame: StoppedFrame) -> Assign | None:
@@ -162,10 +168,10 @@ def _assigning(symbol: Symbol, frame: StoppedFrame) -> Assign | None:
     def assign(value: Any) -> None:
         if owner:
             setattr(eval(owner, frame.space, frame.local), attribute, value)
-        elif frame.innermost:
+        elif frame.settable:
             frame.changes[symbol.code] = value
         else:
-            hint = "step out to it first"
-            raise UsageError(f"{symbol.name} is a variable of a function that has called another one", hint=hint)
+            what = f"the local variable {symbol.name} can be set only in the POU that has stopped at a line"
+            raise UsageError(what, hint="step to a line of its POU first")
 
     return assign

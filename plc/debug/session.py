@@ -32,7 +32,10 @@ CAPABILITIES = {
     "supportsLogPoints": True,
     "supportsSetVariable": True,
     "supportsSetExpression": True,
-    "exceptionBreakpointFilters": [{"filter": "errors", "label": "Errors in a scan", "default": True}],
+    "exceptionBreakpointFilters": [
+        {"filter": "errors", "label": "Errors in a scan", "default": True},
+        {"filter": "assertions", "label": "Failed assertions of unit tests", "default": True},
+    ],
 }
 
 
@@ -110,7 +113,8 @@ class Session:
         """Send the message of a logpoint."""
         path = Path(frame.f_code.co_filename)
         source = {"name": path.name, "path": os.path.realpath(path)}
-        self.output(f"{_time_text(frame.f_globals)}: {text}", "console", source=source, line=frame.f_lineno)
+        # some editors show no output of the category console
+        self.output(f"{_time_text(frame.f_globals)}: {text}", source=source, line=frame.f_lineno)
 
     # -- breakpoints ------------------------------------------------------------------------------------------------------
 
@@ -161,7 +165,8 @@ class Session:
         return {"breakpoints": [{"line": n} for n in sorted(self._lines.get(file, ())) if first <= n <= last]}
 
     def do_setExceptionBreakpoints(self, given: dict[str, Any]) -> None:
-        self.tracer.stop_on_errors = "errors" in given.get("filters", ())
+        chosen = given.get("filters", ())
+        self.tracer.stop_on_errors, self.tracer.stop_on_failures = "errors" in chosen, "assertions" in chosen
 
     def _file(self, path: str) -> str:
         """Return the name by which the program knows the file `path`; "" if it is not part of the program."""
@@ -209,7 +214,8 @@ class Session:
 
     def do_variables(self, given: dict[str, Any]) -> dict[str, Any]:
         frame, found = self._listed(int(given["variablesReference"]))
-        return {"variables": [{"name": one.name, **self._value(one, frame, "value")} for one in found]}
+        described = [{"name": one.name, "evaluateName": one.path, **self._value(one, frame, "value")} for one in found]
+        return {"variables": described}
 
     def _listed(self, number: int) -> tuple[StoppedFrame, list[Variable]]:
         """Return the frame and the variables that a handle lists."""
@@ -249,6 +255,7 @@ class Session:
             key: one.text,
             "type": str(one.type),
             "variablesReference": self._handle(frame, one) if one.has_parts else 0,
+            **({"presentationHint": {"attributes": ["readOnly"]}} if one.assign is None and not one.has_parts else {}),
         }
 
     def _chosen(self, number: int) -> StoppedFrame:

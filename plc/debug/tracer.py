@@ -40,11 +40,11 @@ class SessionEnded(BaseException):
 class StoppedFrame:
     """A frame of a stopped program. `changes` are new values of its local names, which it takes when it goes on.
 
-    Python accepts new values only for the local names of the frame that stopped (`innermost`).
+    Python accepts new values only for the local names of the frame that stopped at a line (`settable`).
     """
 
     frame: FrameType
-    innermost: bool
+    settable: bool
     changes: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -84,6 +84,8 @@ class Tracer:
         self.frames: list[StoppedFrame] = []
         """While the program is stopped: the frames of the source, the innermost first."""
         self.stop_on_errors = True
+        self.stop_on_failures = True
+        """Whether the program stops at a failed assertion, which `failed` reports."""
         self.ending = False
         """Whether the program ends at its next line."""
         self._stopped, self._logged, self._wait = stopped, logged, wait
@@ -125,18 +127,29 @@ class Tracer:
         """Stop at the next line of the source."""
         self._pausing = True
 
+    def failed(self, text: str) -> None:
+        """Stop at the statement that the program executes, because an assertion failed there. Code that it calls may call this."""
+        frame: FrameType | None = sys._getframe(1)
+        while frame is not None and not self._is_shown(frame):
+            frame = frame.f_back
+        if self.stop_on_failures and frame is not None:
+            self._stop(frame, "exception", text, settable=False)
+
     def release(self) -> None:
         """Stop nowhere any more."""
         self.breakpoints = {}
-        self._pausing = self.stop_on_errors = False
+        self._pausing = self.stop_on_errors = self.stop_on_failures = False
         self._step = None
 
     def _call(self, frame: FrameType, event: str, arg: Any) -> Callable[..., Any] | None:
-        code = frame.f_code
-        if code.co_filename not in self.files or not is_body(code):
+        if not self._is_shown(frame):
             return None
         self._frames += 1
         return self._line
+
+    def _is_shown(self, frame: FrameType) -> bool:
+        """Return whether a frame executes a body in the source."""
+        return frame.f_code.co_filename in self.files and is_body(frame.f_code)
 
     def _line(self, frame: FrameType, event: str, arg: Any) -> Callable[..., Any]:
         if event == "line":
@@ -184,12 +197,13 @@ class Tracer:
         self._logged(frame, found.text(pou, frame))
         return None
 
-    def _stop(self, frame: FrameType, reason: str, text: str) -> None:
+    def _stop(self, frame: FrameType, reason: str, text: str, *, settable: bool = True) -> None:
+        """Wait until the program may go on. `settable`: whether Python takes over new values for the local names of `frame`."""
         self._pausing, self._step = False, None
         at: FrameType | None = frame
         while at is not None and len(self.frames) < MAX_FRAMES:
-            if at.f_code.co_filename in self.files and is_body(at.f_code):
-                self.frames.append(StoppedFrame(at, innermost=at is frame))
+            if self._is_shown(at):
+                self.frames.append(StoppedFrame(at, settable=settable and at is frame))
             at = at.f_back
         innermost = self.frames[0]
         self._stopped(reason, text)

@@ -31,7 +31,7 @@ class Adapter(Session):
         self._commands: SimpleQueue[Resume] = SimpleQueue()
         super().__init__(messages.send, Tracer(self.stopped, self.logged, self._commands.get), self._commands.put)
         self._messages, self._launch = messages, launch
-        self._debuggee = Debuggee([], lambda say: True)
+        self._debuggee = Debuggee([], lambda say, failed: True)
         self._thread: threading.Thread | None = None
         self._relay: Relay | None = None
         """To the PLC of a running instance, whose session answers the requests after the editor has attached to it."""
@@ -81,7 +81,7 @@ class Adapter(Session):
         def work() -> None:
             nonlocal well
             try:
-                well = self._debuggee.run(self.output)
+                well = self._debuggee.run(self.output, self.tracer.failed)
             except FieldtwinError as e:
                 self.output(str(e), "stderr")
 

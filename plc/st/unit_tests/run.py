@@ -7,7 +7,7 @@ block in a test executes it once, as a scan does; time passes with ADVANCE_TIME 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -63,6 +63,10 @@ class TestResult:
         return [one for one in self.assertions if one.failed]
 
 
+Failed = Callable[[AssertionResult], None]
+"""Called while the test is at an assertion that has failed."""
+
+
 @dataclass(slots=True)
 class _Count:
     executed: int = 0
@@ -74,10 +78,12 @@ class _Count:
 class _TestContext(Context):
     """The context of compiled code in a test: its time is that of the test."""
 
-    __slots__ = ("_advances", "_ordered", "counts", "finished")
+    __slots__ = ("_advances", "_failed", "_ordered", "counts", "finished")
 
-    def __init__(self, recorded: set[Any]) -> None:
+    def __init__(self, recorded: set[Any], failed: Callable[[int], None] | None) -> None:
+        """`failed` is called with the number of an assertion when it fails for the first time."""
         super().__init__()
+        self._failed = failed
         self.first_scan = True
         self.counts: dict[int, _Count] = {}
         self.finished: set[int] = set()
@@ -96,6 +102,8 @@ class _TestContext(Context):
         if not count.failed:
             count.failed, count.t_ns = not holds, self.now_ns
             count.values = shown if holds else copy.deepcopy(shown)  # an array may change after this
+            if not holds and self._failed is not None:
+                self._failed(number)
 
     @staticmethod
     def same(actual: Any, expected: Any, within: float | None) -> bool:
@@ -126,15 +134,28 @@ class _TestContext(Context):
         self.left = MAX_STEPS
 
 
-def run_tests(unit: CompiledUnit, tests: Iterable[TranslatedTest], recorded: set[Any]) -> Iterator[TestResult]:
-    """Run each test. The probes for coverage add their records to `recorded`: numbers, and pairs of a number and a value."""
+def run_tests(
+    unit: CompiledUnit, tests: Iterable[TranslatedTest], recorded: set[Any], failed: Failed | None = None
+) -> Iterator[TestResult]:
+    """Run each test. The probes for coverage add their records to `recorded`: numbers, and pairs of a number and a value.
+
+    `failed` is called at the first failure of each assertion.
+    """
     for _, group in groupby(tests, lambda test: test.program):
-        yield from _run(unit, list(group), recorded)
+        yield from _run(unit, list(group), recorded, failed)
 
 
-def _run(unit: CompiledUnit, tests: list[TranslatedTest], recorded: set[Any]) -> Iterator[TestResult]:
+def _run(
+    unit: CompiledUnit, tests: list[TranslatedTest], recorded: set[Any], failed: Failed | None
+) -> Iterator[TestResult]:
     """Run the program of `tests`: once, or if they are cyclic, until all of them have ended."""
-    context = _TestContext(recorded)
+    texts = {number: text for test in tests for number, text in test.assertions.items()}
+
+    def report(number: int) -> None:
+        if failed is not None:
+            failed(_result(number, texts[number], context, unit))
+
+    context = _TestContext(recorded, report)
     error, place = "", ("", 0)
     try:
         program = Resource(unit, context).created(f"P_{tests[0].program}")

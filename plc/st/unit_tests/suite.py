@@ -19,7 +19,7 @@ from fieldtwin.plc.st.project import read_with
 from fieldtwin.plc.st.tcunit_suites import is_suite
 from fieldtwin.plc.st.unit_tests.assertions import TranslatedTest
 from fieldtwin.plc.st.unit_tests.blocks import programs_as_blocks
-from fieldtwin.plc.st.unit_tests.run import TestResult, run_tests
+from fieldtwin.plc.st.unit_tests.run import Failed, TestResult, run_tests
 from fieldtwin.plc.st.unit_tests.tcunit import suites_as_programs
 from fieldtwin.plc.st.unit_tests.translate import tests_as_programs
 
@@ -36,9 +36,9 @@ class Suite:
     """The probes of the POUs that no test uses: their places count as not executed."""
     _recorded: set[Any]
 
-    def run(self) -> Iterator[TestResult]:
-        """Run each test."""
-        yield from run_tests(self.unit, self.tests, self._recorded)
+    def run(self, failed: Failed | None = None) -> Iterator[TestResult]:
+        """Run each test. `failed` is called at the first failure of each assertion."""
+        yield from run_tests(self.unit, self.tests, self._recorded, failed)
 
     def coverage(self) -> dict[Place, bool]:
         """Return each place of the tested files, and whether a test has executed it."""

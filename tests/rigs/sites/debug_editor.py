@@ -85,14 +85,18 @@ class Editor:
                 return body
 
     def begin(
-        self, lines: Mapping[Path, Sequence[int | dict[str, Any]]], request: str = "launch", **arguments: Any
+        self,
+        lines: Mapping[Path, Sequence[int | dict[str, Any]]],
+        request: str = "launch",
+        filters: Sequence[str] = ("errors",),
+        **arguments: Any,
     ) -> list[dict[str, Any]]:
         """Launch or attach with breakpoints, each a line or the arguments of the protocol, and return the answers for them."""
         self.ask("initialize", adapterID="fieldtwin")
         self.ask(request, **arguments)
         self.wait("initialized")
         placed = [answer for path, wanted in lines.items() for answer in self.breakpoints(path, *wanted)]
-        self.ask("setExceptionBreakpoints", filters=["errors"])
+        self.ask("setExceptionBreakpoints", filters=list(filters))
         self.ask("configurationDone")
         return placed
 

@@ -173,6 +173,84 @@ def test_an_error_in_a_scan_stops_at_its_line(project: Path, opened: Open) -> No
     assert editor.ends() == 0
 
 
+FAILING = """FUNCTION Half : INT
+VAR_INPUT of : INT; END_VAR
+  Half := of / 2;
+END_FUNCTION
+TEST 'halves'
+VAR i, halved : INT; END_VAR
+  FOR i := 1 TO 4 DO
+    halved := Half(i);
+    ASSERT_EQ(halved, 0, 'all are small');
+  END_FOR
+  ASSERT_TRUE(i > 9);
+END_TEST
+"""
+
+
+def test_a_failed_assertion_stops_at_its_line(project: Path, opened: Open) -> None:
+    (project / "half.test.st").write_text(FAILING)
+    editor = opened(str(project / "half.test.st"))
+    editor.begin({}, filters=["errors", "assertions"])
+    stopped = editor.wait("stopped")
+    text = "all are small: ASSERT_EQ(halved, 0): expected 0, got 1"
+    assert (stopped["reason"], stopped["text"]) == ("exception", text)
+    assert editor.place() == ("halves", 9)
+    assert editor.value("i") == "2"
+    assert editor.goes_on()["text"] == "ASSERT_TRUE(i > 9): expected TRUE, got FALSE"  # each assertion stops once
+    editor.ask("continue", threadId=1)
+    lines = [editor.wait("output")["output"] for _ in range(2)]
+    assert lines == ["failed  halves  0 s\n", f"  {text} ({project / 'half.test.st'}:9, at 0.000 s)\n"]
+    assert editor.wait("exited") == {"exitCode": 1}
+    assert editor.ends() == 0
+
+
+def test_steps_and_ends_after_a_failed_assertion(project: Path, opened: Open) -> None:
+    (project / "half.test.st").write_text(FAILING)
+    editor = opened(str(project / "half.test.st"))
+    editor.begin({}, filters=["assertions"])
+    editor.wait("stopped")
+    assert editor.goes_on("next")["reason"] == "step"
+    assert editor.place() == ("halves", 7)
+    editor.ask("setExpression", expression="i", value="1", frameId=1)
+    editor.ask("continue", threadId=1)
+    assert editor.wait("stopped")["reason"] == "exception"
+    editor.ask("terminate")
+    editor.wait("terminated")
+    assert editor.ends() == 0
+
+
+def test_a_failed_assertion_does_not_stop_if_the_editor_has_not_chosen_it(project: Path, opened: Open) -> None:
+    (project / "half.test.st").write_text(FAILING)
+    editor = opened(str(project / "half.test.st"))
+    editor.begin({}, filters=[])
+    while (event := editor.event())["event"] != "exited":
+        assert event["event"] == "output"
+    assert editor.ends() == 0
+
+
+def test_each_variable_names_an_expression_for_a_watch(editor: ProcessEditor, project: Path) -> None:
+    editor.begin({project / "counter.test.st": [7]})
+    editor.wait("stopped")
+    seen: dict[str, str] = {}
+    constant: set[str] = set()
+
+    def visit(reference: int) -> None:
+        for one in editor.ask("variables", variablesReference=reference)["variables"]:
+            seen[one["evaluateName"]] = one["value"]
+            if "readOnly" in one.get("presentationHint", {}).get("attributes", ()):
+                constant.add(one["evaluateName"])
+            if one["variablesReference"]:
+                visit(one["variablesReference"])
+
+    for scope in editor.ask("scopes", frameId=1)["scopes"]:
+        visit(scope["variablesReference"])
+    assert {"c", "c.timer", "c.timer.ET", "c.last[2]", "zero", "limit"} < set(seen)
+    assert {path: editor.value(path) for path in seen} == seen
+    assert constant == {"c.timer.Q", "c.timer.ET"}
+    assert editor.ends() == 0
+
+
 def test_a_source_with_an_error_is_a_failed_launch(project: Path, opened: Open) -> None:
     (project / "bad.test.st").write_text("TEST 'bad'\n  nothing := 1;\nEND_TEST\n")
     editor = opened()

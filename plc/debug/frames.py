@@ -93,9 +93,7 @@ class Units:
             ]
         if isinstance(kind, ty.Struct | ty.Block):
             return [
-                Variable(
-                    name, f"{variable.path}.{name}", of, inside, inspection.assigning((kind, value), f".{name}")
-                )
+                Variable(name, f"{variable.path}.{name}", of, inside, inspection.assigning((kind, value), f".{name}"))
                 for name, of, inside in inspection.members(kind, value)
             ]
         return []

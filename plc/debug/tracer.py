@@ -128,7 +128,7 @@ class Tracer:
         self._pausing = True
 
     def failed(self, text: str) -> None:
-        """Stop at the statement that the program executes, because an assertion failed there. Code that it calls may call this."""
+        """Stop at the statement of the source that has called the caller of this, because its assertion has failed."""
         frame: FrameType | None = sys._getframe(1)
         while frame is not None and not self._is_shown(frame):
             frame = frame.f_back

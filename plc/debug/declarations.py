@@ -1,4 +1,4 @@
-"""The lines of declarations whose initial values are executed, at which a debugger should not stop by itself."""
+"""The lines of declarations at which a debugger should not stop by itself: initial values are executed, and the entry of a POU."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fieldtwin.plc.st.syntax.walk import nodes
 
 
 def declaration_lines(units: Iterable[CompiledUnit]) -> dict[str, set[int]]:
-    """Return, by file, the lines that declare variables or a result, and on which no statement begins."""
+    """Return, by file, the lines that name a POU, or declare variables or a result, and on which no statement begins."""
     found: dict[str, set[int]] = {}
     for pou in (pou for unit in units for pou in unit.source.pous):
         for pos in _declared(pou):
@@ -23,6 +23,7 @@ def declaration_lines(units: Iterable[CompiledUnit]) -> dict[str, set[int]]:
 
 
 def _declared(pou: t.Pou) -> Iterator[t.Pos]:
+    yield pou.pos
     if pou.returns is not None:
         yield pou.returns.pos
     for v in (v for block in pou.blocks for v in block.variables):

@@ -111,10 +111,8 @@ class Session:
 
     def logged(self, frame: FrameType, text: str) -> None:
         """Send the message of a logpoint."""
-        path = Path(frame.f_code.co_filename)
-        source = {"name": path.name, "path": os.path.realpath(path)}
         # some editors show no output of the category console
-        self.output(f"{_time_text(frame.f_globals)}: {text}", source=source, line=frame.f_lineno)
+        self.output(f"{_time_text(frame.f_globals)}: {text}", **place(frame.f_code.co_filename, frame.f_lineno))
 
     # -- breakpoints ------------------------------------------------------------------------------------------------------
 
@@ -194,10 +192,8 @@ class Session:
         return {"stackFrames": described, "totalFrames": len(frames)}
 
     def _frame(self, number: int, frame: StoppedFrame) -> dict[str, Any]:
-        path = Path(frame.code.co_filename)
-        source = {"name": path.name, "path": os.path.realpath(path)}
-        title, line = self._units.title(frame.code), frame.frame.f_lineno
-        return {"id": number, "name": title, "line": line, "column": 1, "source": source}
+        title = self._units.title(frame.code)
+        return {"id": number, "name": title, "column": 1, **place(frame.code.co_filename, frame.frame.f_lineno)}
 
     def do_scopes(self, given: dict[str, Any]) -> dict[str, Any]:
         frame = self._chosen(int(given["frameId"]))
@@ -290,6 +286,11 @@ class Session:
 
     def do_pause(self, given: dict[str, Any]) -> None:
         self.tracer.pause()
+
+
+def place(path: str, line: int) -> dict[str, Any]:
+    """Return the part of an event or a response that names a line of a file."""
+    return {"source": {"name": Path(path).name, "path": os.path.realpath(path)}, "line": line}
 
 
 def _failure(text: str) -> dict[str, Any]:

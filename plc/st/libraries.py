@@ -164,6 +164,8 @@ def _of_variables(part: t.Pou | t.Test, outer: frozenset[str]) -> Iterator[str]:
 
 def _references(root: Any, local: frozenset[str]) -> Iterator[str]:
     for node in nodes(root):
+        if isinstance(node, t.Call):  # a function may have the name of a local variable
+            yield node.ref.name.lower()
         if isinstance(node, t.NamedType | t.SubrangeType) or (
             isinstance(node, t.Ref) and node.name.lower() not in local
         ):

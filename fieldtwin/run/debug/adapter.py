@@ -10,8 +10,8 @@ from collections.abc import Callable
 from queue import SimpleQueue
 from typing import Any
 
-from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
-from fieldtwin.plc.debug.session import Session
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
+from fieldtwin.plc.debug.session import Session, place
 from fieldtwin.plc.debug.tracer import Resume, Tracer
 from fieldtwin.run.debug.arguments import ATTACH, LAUNCH, checked
 from fieldtwin.run.debug.messages import Messages
@@ -59,7 +59,12 @@ class Adapter(Session):
     def do_launch(self, given: dict[str, Any]) -> None:
         if self._thread is not None:
             raise UsageError("the program has been launched before")
-        self._debuggee = self._launch(checked("launch", given, LAUNCH))
+        try:
+            self._debuggee = self._launch(checked("launch", given, LAUNCH))
+        except FileInvalid as e:
+            for one in (e, *e.others):  # an editor shows the failure of the request only for some seconds
+                self.output(str(one), "stderr", **(place(one.path, one.line) if one.line else {}))
+            raise
         self.show(self._debuggee.units, self._debuggee.names)
         if given.get("stopOnEntry") is True:
             self.tracer.step_first()

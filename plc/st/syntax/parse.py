@@ -38,7 +38,7 @@ _OF_NAMESPACES = re.compile(
 """The words of namespaces around and in POUs. Strings are skipped."""
 
 _DECLARED = re.compile(
-    r"\b(?:FUNCTION_BLOCK|FUNCTION|CLASS|INTERFACE|TYPE)\s+(?:(?:PUBLIC|INTERNAL|ABSTRACT|FINAL)\s+)*([A-Za-z_]\w*)",
+    r"\b(?:PROGRAM|FUNCTION_BLOCK|FUNCTION|CLASS|INTERFACE|TYPE)\s+(?:(?:PUBLIC|INTERNAL|ABSTRACT|FINAL)\s+)*([A-Za-z_]\w*)",
     re.IGNORECASE,
 )
 

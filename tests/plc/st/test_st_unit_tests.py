@@ -213,6 +213,20 @@ def test_errors_in_tests_have_their_place(tmp_path: Path, test: str, error: str)
     assert (raised.value.path, raised.value.line) == (str(tmp_path / "pump.test.st"), 2)
 
 
+def test_an_error_in_the_tested_program_is_reported_at_its_place(tmp_path: Path) -> None:
+    with pytest.raises(FileInvalid) as raised:
+        ran(tmp_path, "TEST 'a' VAR p : Pump; END_VAR p(); END_TEST", PUMP.replace("valve := state", "valve = state"))
+    assert "not Structured Text" in raised.value.message
+    assert (raised.value.path, raised.value.line) == (str(tmp_path / "pump.st"), 11)
+
+
+def test_a_function_may_have_the_name_of_a_variable_of_its_caller(tmp_path: Path) -> None:
+    beside = """FUNCTION Share : INT VAR_INPUT x : INT; END_VAR Share := x / 2; END_FUNCTION
+FUNCTION_BLOCK Tank VAR share : INT; END_VAR VAR_OUTPUT n : INT; END_VAR share := Share(8); n := share; END_FUNCTION_BLOCK"""
+    test = "TEST 'a' VAR t : Tank; END_VAR t(); ASSERT_EQ(t.n, 4); END_TEST"
+    assert not only(ran(tmp_path, test, beside)).failed
+
+
 def test_two_tests_have_different_names(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="a second test with the name 'a'"):
         ran(tmp_path, "TEST 'a' END_TEST TEST 'a' END_TEST")

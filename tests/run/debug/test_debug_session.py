@@ -105,6 +105,20 @@ def test_steps_go_over_into_and_out_of_calls(editor: ProcessEditor, project: Pat
     assert editor.ends() == 0
 
 
+def test_a_step_into_a_block_stops_at_its_first_statement(editor: ProcessEditor, project: Path) -> None:
+    (placed,) = editor.begin({project / "counter.test.st": [4]})
+    assert placed["line"] == 4
+    editor.wait("stopped")
+    editor.goes_on("stepIn")
+    assert editor.place() == ("Counter", 10)
+    # a breakpoint at a comment or a blank line moves to a statement, and one at the name of a block stops at each call of it
+    moved = editor.breakpoints(project / "counter.st", 5, 6)
+    assert [one["line"] for one in moved] == [10, 6]
+    editor.goes_on()
+    assert editor.place() == ("Counter", 6)
+    assert editor.ends() == 0
+
+
 def test_a_step_over_a_call_executes_the_whole_line(editor: ProcessEditor, project: Path) -> None:
     editor.begin({project / "counter.test.st": [4]})  # a call with an argument: several instructions in one line
     editor.wait("stopped")
@@ -258,6 +272,9 @@ def test_a_source_with_an_error_is_a_failed_launch(project: Path, opened: Open) 
     answer = editor.request("launch", program=str(project / "bad.test.st"))
     assert not answer["success"]
     assert "bad.test.st:2:3: a variable 'nothing' is not declared" in answer["message"]
+    shown = editor.wait("output")
+    assert (shown["category"], shown["source"]["name"], shown["line"]) == ("stderr", "bad.test.st", 2)
+    assert shown["output"].rstrip() in answer["message"]
     assert editor.ends() == 0
 
 

@@ -1,4 +1,4 @@
-"""The lines of declarations at which a debugger should not stop by itself: initial values are executed, and the entry of a POU."""
+"""The lines of declarations at which a debugger should not stop by itself: those of initial values, and of the names of POUs."""
 
 from __future__ import annotations
 

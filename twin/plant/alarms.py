@@ -13,8 +13,7 @@ from fieldtwin.gateway.core.image.layout import TagKind
 from fieldtwin.gateway.runtime.alarms.alarm_list import ALARM, AlarmConfig
 from fieldtwin.plc.binding import BoundProgram
 from fieldtwin.plc.program import Program
-from fieldtwin.twin.plant.alarm_members import members_in, members_in_alarms
-from fieldtwin.twin.plant.names import incomplete_in, names_in
+from fieldtwin.twin.plant.names import incomplete_in, members_in, members_in_alarms, names_in
 from fieldtwin.twin.site.system import System
 
 _NOT_IN_ALARMS = {

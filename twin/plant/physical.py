@@ -36,9 +36,8 @@ from fieldtwin.plc.binding import BoundProgram, InputBinding, check_kind, image_
 from fieldtwin.plc.cycle.start import StartPolicy
 from fieldtwin.plc.program import Role, Variable
 from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig, TaskSpec
-from fieldtwin.twin.plant.alarm_members import members_in_alarms
 from fieldtwin.twin.plant.alarms import load_alarms
-from fieldtwin.twin.plant.variable_users import variable_users
+from fieldtwin.twin.plant.names import members_in_alarms, variable_users
 from fieldtwin.twin.site.schema import StartForm
 from fieldtwin.twin.site.system import System
 

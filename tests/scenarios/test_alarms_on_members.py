@@ -12,8 +12,8 @@ from fieldtwin.results.model import ScenarioResult, Verdict
 from fieldtwin.results.trace import TraceKind
 from fieldtwin.run.targets.virtual_scenario import run_virtual
 from fieldtwin.scenarios.language.form import load_scenario
+from fieldtwin.twin.plant.names import variable_users
 from fieldtwin.twin.plant.physical import alarms_of, image_layout, programs_of
-from fieldtwin.twin.plant.variable_users import variable_users
 from fieldtwin.twin.site.system import System, load_system
 
 PROGRAM = """TYPE Mode : (idle, run, fault) := idle; Level : STRUCT now : REAL; high : BOOL; END_STRUCT END_TYPE

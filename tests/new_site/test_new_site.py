@@ -7,6 +7,7 @@ import json
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import click
 import pytest
@@ -54,6 +55,17 @@ def devices(*texts: str) -> list[str]:
     return [word for text in texts for word in ("--device", text)]
 
 
+def each_combination() -> list[Any]:
+    """Return each combination of a profile and a control. Two of the four controls of each profile are long tests, because
+    profile and control are written independently of each other.
+    """
+    return [
+        pytest.param(profile, control, marks=[] if (row + column) % 4 < 2 else pytest.mark.long)
+        for row, profile in enumerate(PROFILES)
+        for column, control in enumerate(CONTROLS)
+    ]
+
+
 def assert_scenarios_pass(folder: Path, expected: int) -> None:
     found = check_site(folder)
     assert (found.errors, found.warnings) == ([], [])
@@ -62,8 +74,7 @@ def assert_scenarios_pass(folder: Path, expected: int) -> None:
     assert done.output.splitlines()[-1] == f"{expected} passed"
 
 
-@pytest.mark.parametrize("control", CONTROLS)
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize(("profile", "control"), each_combination())
 def test_scenarios_of_a_new_site_pass_with_each_profile_and_control(tmp_path: Path, profile: str, control: str) -> None:
     folder = (
         tmp_path / f"{name_from(profile, 'site')}_{control}"

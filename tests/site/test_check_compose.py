@@ -9,8 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from fieldtwin.cli import command_lines
+from fieldtwin.cli.main import cli
 from fieldtwin.site.check import check_site
 
 CHECKOUT = Path(__file__).parents[2]
@@ -18,8 +20,8 @@ TUTORIALS = CHECKOUT / "docs" / "tutorials"
 
 
 def new(folder: Path, *options: str) -> Path:
-    command = [sys.executable, "-m", "fieldtwin", "new", str(folder), "--yes", *options]
-    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    done = CliRunner().invoke(cli, ["new", str(folder), "--yes", *options], standalone_mode=False)
+    assert (done.exception, done.return_value) == (None, 0), done.output
     return folder
 
 

@@ -292,8 +292,11 @@ def test_errors_in_expressions_name_the_expression() -> None:
     [
         ("PROGRAM P VAR_INPUT n : INT; END_VAR VAR s : STRING; END_VAR s := MAX(INT_TO_STRING(n), 'x'); END_PROGRAM",
          "this operation on a STRING"),
-        ("PROGRAM P VAR_INPUT n : DINT; END_VAR VAR i : DINT; END_VAR WHILE i < n DO i := i + 1; END_WHILE END_PROGRAM",
+        ("PROGRAM P VAR_INPUT n : DINT; END_VAR VAR i : DINT; END_VAR FOR i := 1 TO n DO ; END_FOR END_PROGRAM",
          "a loop that can run more than 200 times"),
+        pytest.param(
+         "PROGRAM P VAR_INPUT n : DINT; END_VAR VAR i : DINT; END_VAR WHILE i < n DO i := i + 1; END_WHILE END_PROGRAM",
+         "a loop that can run more than 200 times", marks=pytest.mark.long),
         ("INTERFACE I END_INTERFACE FUNCTION_BLOCK F IMPLEMENTS I END_FUNCTION_BLOCK "
          "PROGRAM P VAR f : F; i : I; END_VAR i := f; END_PROGRAM", "a variable of an interface type: i"),
         ("PROGRAM P VAR n : INT; r : REF_TO INT; END_VAR r := REF(n); END_PROGRAM", "a reference or pointer"),

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
+from property_examples import has_examples, reduce_examples
 
 # jsonschema imports it for the format "iri", which no test checks, and it then builds 38 parsers: five seconds in each process.
 sys.modules["rfc3987_syntax"] = None  # type: ignore[assignment]
@@ -79,7 +80,17 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     selected = ONE_MARK.fullmatch(str(config.getoption("markexpr")))
     if selected is None or collection_path.suffix != ".py":
         return None
-    return True if f"mark.{selected[1]}" not in collection_path.read_text("utf-8") else None
+    text = collection_path.read_text("utf-8")
+    return True if f"mark.{selected[1]}" not in text and not (selected[1] == "long" and "@given" in text) else None
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Let property tests try a third of their examples in the fast tests, and all of them among the long tests."""
+    if isinstance(item, pytest.Function) and has_examples(item.obj):
+        if are_long(item.config):
+            item.add_marker(pytest.mark.long)
+        elif "not long" in str(item.config.getoption("markexpr")):
+            reduce_examples(item.obj)
 
 
 LINES = {

@@ -22,16 +22,29 @@ function find(command, folder) {
     });
 }
 
+/** Return the path of the command that the settings of a folder name, or nothing, and the name in the settings. */
+function adapter(folder) {
+  const command = vscode.workspace.getConfiguration("fieldtwin", folder).get("command");
+  return { command, found: find(command, folder && folder.uri.fsPath) };
+}
+
 function createDebugAdapterDescriptor(session) {
-  const folder = session.workspaceFolder && session.workspaceFolder.uri.fsPath;
-  const command = vscode.workspace.getConfiguration("fieldtwin", session.workspaceFolder).get("command");
-  const found = find(command, folder);
-  if (!found) {
-    throw new Error(
-      `The command ${command} was not found. Install fieldtwin, or set fieldtwin.command to its path, such as .venv/bin/fieldtwin.`
-    );
+  const folder = session.workspaceFolder;
+  return new vscode.DebugAdapterExecutable(adapter(folder).found, ["plc", "debug"], { cwd: folder && folder.uri.fsPath });
+}
+
+/** Begin no session without the command, and offer the settings, which name it. */
+async function resolveDebugConfigurationWithSubstitutedVariables(folder, given) {
+  const { command, found } = adapter(folder);
+  if (found || given.debugServer) {
+    return given;
   }
-  return new vscode.DebugAdapterExecutable(found, ["plc", "debug"], { cwd: folder });
+  const text = `The command ${command} was not found. Install fieldtwin, or set fieldtwin.command to its path, such as .venv/bin/fieldtwin.`;
+  const settings = "Open Settings";
+  if ((await vscode.window.showErrorMessage(text, { modal: true }, settings)) === settings) {
+    await vscode.commands.executeCommand("workbench.action.openSettings", "fieldtwin.command");
+  }
+  return undefined;
 }
 
 /** Without a launch.json, debug the unit tests of the open file. */
@@ -43,6 +56,9 @@ function resolveDebugConfiguration(folder, given) {
 exports.activate = (context) => {
   context.subscriptions.push(
     vscode.debug.registerDebugAdapterDescriptorFactory("fieldtwin", { createDebugAdapterDescriptor }),
-    vscode.debug.registerDebugConfigurationProvider("fieldtwin", { resolveDebugConfiguration })
+    vscode.debug.registerDebugConfigurationProvider("fieldtwin", {
+      resolveDebugConfiguration,
+      resolveDebugConfigurationWithSubstitutedVariables,
+    })
   );
 };

@@ -52,6 +52,8 @@ class Session:
         self.send, self.tracer = send, tracer
         self._resume_program = resume
         self._units = Units([], {})
+        self.started_ns: Callable[[], int] = lambda: 0
+        """Returns the time of the program's clock at which the program started, for a program that runs in virtual time."""
         self._code: dict[str, list[CodeType]] = {}
         """By file: the bodies of its POUs."""
         self._lines: dict[str, set[int]] = {}
@@ -112,7 +114,7 @@ class Session:
     def logged(self, frame: FrameType, text: str) -> None:
         """Send the message of a logpoint."""
         # some editors show no output of the category console
-        self.output(f"{_time_text(frame.f_globals)}: {text}", **place(frame.f_code.co_filename, frame.f_lineno))
+        self.output(f"{self._time_text(frame.f_globals)}: {text}", **place(frame.f_code.co_filename, frame.f_lineno))
 
     # -- breakpoints ------------------------------------------------------------------------------------------------------
 
@@ -176,10 +178,14 @@ class Session:
     def stopped(self, reason: str, text: str) -> None:
         """Tell the editor that the program has stopped."""
         body = {"reason": reason, "threadId": THREAD, "allThreadsStopped": True}
-        body["description"] = _time_text(self.tracer.frames[0].space)
+        body["description"] = self._time_text(self.tracer.frames[0].space)
         if text:
             body["text"] = text
         self.send("event", event="stopped", body=body)
+
+    def _time_text(self, space: Mapping[str, Any]) -> str:
+        """Return the time of the scan that executes the code with these global names, since the start of the program."""
+        return f"at {(space['_c'].now_ns - self.started_ns()) / NS_PER_S:.3f} s"
 
     def do_threads(self, given: dict[str, Any]) -> dict[str, Any]:
         return {"threads": [{"id": THREAD, "name": "PLC"}]}
@@ -296,8 +302,3 @@ def place(path: str, line: int) -> dict[str, Any]:
 def _failure(text: str) -> dict[str, Any]:
     """Return the part of a response that says why a request failed. The body is for editors that do not show the message."""
     return {"success": False, "message": text, "body": {"error": {"id": 1, "format": text}}}
-
-
-def _time_text(space: Mapping[str, Any]) -> str:
-    """Return the time of the scan that executes the code with these global names."""
-    return f"at {space['_c'].now_ns / NS_PER_S:.3f} s"

@@ -66,6 +66,7 @@ class Adapter(Session):
                 self.output(str(one), "stderr", **(place(one.path, one.line) if one.line else {}))
             raise
         self.show(self._debuggee.units, self._debuggee.names)
+        self.started_ns = self._debuggee.started_ns
         if given.get("stopOnEntry") is True:
             self.tracer.step_first()
         if given.get("noDebug") is True:

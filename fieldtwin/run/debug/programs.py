@@ -29,6 +29,8 @@ class Debuggee:
     units: list[CompiledUnit]
     run: Callable[[Output, Failed], bool]
     names: Mapping[str, str] = field(default_factory=dict)
+    started_ns: Callable[[], int] = lambda: 0
+    """Returns the time of the program's clock at its start, while it runs."""
 
 
 def unit_tests(path: Path, dialect: Dialect, libraries: tuple[Path, ...]) -> Debuggee:
@@ -38,11 +40,16 @@ def unit_tests(path: Path, dialect: Dialect, libraries: tuple[Path, ...]) -> Deb
     def run(say: Output, failed: Failed) -> bool:
         well = True
         for result in suite.run(lambda one: failed(_about(one))):
-            well = well and not result.failed and not result.error
-            verdict = "error" if result.error else "failed" if result.failed else "passed"
+            executed = any(one.executed for one in result.assertions)
+            well = well and executed and not result.failed and not result.error
+            verdict = (
+                "error" if result.error else "failed" if result.failed else "passed" if executed else "inconclusive"
+            )
             say(f"{verdict}  {result.test.name}  {result.simulated_ns / NS_PER_S:g} s")
             if result.error:
                 say(f"  {result.error} ({result.error_place[0]}:{result.error_place[1]})")
+            elif not executed:
+                say("  the test executed no assertion")
             for one in result.failed:
                 place = f"{one.text.pos.path}:{one.text.pos.line}"
                 say(f"  {_about(one)} ({place}, at {one.t_ns / NS_PER_S:.3f} s)")
@@ -62,6 +69,7 @@ class _EachScan(VirtualRun):
 
     def attach(self, running: VirtualSystems) -> None:
         super().attach(running)
+        self.running = running
         for system in running.systems.values():
             system.run.plc.execute_every_scan()
 
@@ -78,4 +86,7 @@ def virtual_run(options: VirtualOptions, units: list[CompiledUnit]) -> Debuggee:
         say("passed" if summary["ok"] else "failed")
         return bool(summary["ok"])
 
-    return Debuggee(units, run)
+    def started_ns() -> int:
+        return min(system.run.started_ns for system in made.running.systems.values())
+
+    return Debuggee(units, run, started_ns=started_ns)

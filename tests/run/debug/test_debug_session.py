@@ -158,6 +158,16 @@ def test_the_result_of_the_tests_is_shown(editor: ProcessEditor) -> None:
     assert editor.ends() == 0
 
 
+def test_a_test_without_an_assertion_is_inconclusive(project: Path, opened: Open) -> None:
+    (project / "empty.test.st").write_text("TEST 'empty'\nVAR n : INT; END_VAR\n  n := 1;\nEND_TEST\n")
+    editor = opened(str(project / "empty.test.st"))
+    editor.begin({})
+    shown = [editor.wait("output")["output"] for _ in range(2)]
+    assert shown == ["inconclusive  empty  0 s\n", "  the test executed no assertion\n"]
+    assert editor.wait("exited") == {"exitCode": 1}
+    assert editor.ends() == 0
+
+
 def test_a_method_shows_its_variables_and_those_of_its_block(project: Path, opened: Open) -> None:
     (project / "tank.st").write_text(
         "FUNCTION_BLOCK Tank\nVAR level : INT := 3; END_VAR\nMETHOD PUBLIC Fill : INT\nVAR_INPUT by : INT; END_VAR\n"
@@ -311,7 +321,7 @@ def test_the_programs_of_a_system_stop_in_virtual_time(opened: Open) -> None:
     assert editor.value("driving") == "FALSE"
     # nothing changes, but no scan passes by the breakpoint
     editor.breakpoints(program, {"line": 45, "hitCondition": "40"})
-    assert (stopped["description"], editor.goes_on()["description"]) == ("at 1000.230 s", "at 1001.030 s")  # 40 x 20 ms
+    assert (stopped["description"], editor.goes_on()["description"]) == ("at 0.180 s", "at 0.980 s")  # 40 x 20 ms
     editor.breakpoints(program)
     editor.ask("continue", threadId=1)
     assert editor.wait("exited") == {"exitCode": 0}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,37 @@ def test_the_dialects_and_the_files_of_the_extension_exist() -> None:
     assert DEBUGGER["configurationAttributes"]["launch"]["properties"]["dialect"]["enum"] == list(DIALECTS)
     language = MANIFEST["contributes"]["languages"][0]
     assert MANIFEST["contributes"]["breakpoints"] == [{"language": language["id"]}]
-    for named in (MANIFEST["main"], language["configuration"]):
+    (grammar,) = MANIFEST["contributes"]["grammars"]
+    assert grammar["language"] == language["id"]
+    for named in (MANIFEST["main"], language["configuration"], grammar["path"]):
         assert (FOLDER / named).is_file()
+        assert Path(named).name in MANIFEST["files"]
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("'it$'s'", "string.quoted.st"),
+        ("(* a comment", "comment.block.st"),
+        ("T#1s500ms", "constant.numeric.st"),
+        ("16#FF", "constant.numeric.st"),
+        ("end_if", "keyword.control.st"),
+        ("END_FUNCTION_BLOCK", "storage.type.st"),
+        ("VAR_IN_OUT", "storage.type.st"),
+        ("UDINT", "support.type.st"),
+    ],
+)
+def test_the_grammar_of_the_extension_highlights_words(text: str, kind: str) -> None:
+    patterns = json.loads((FOLDER / "st.tmLanguage.json").read_text())["patterns"]
+    first = next(one for one in patterns if re.match(one.get("match", one.get("begin")), text))
+    assert first["name"] == kind
+    if "match" in first:
+        assert re.fullmatch(first["match"], text)
+
+
+def test_the_grammar_of_the_extension_leaves_names_alone() -> None:
+    patterns = json.loads((FOLDER / "st.tmLanguage.json").read_text())["patterns"]
+    assert not [one for one in patterns if "match" in one and re.match(one["match"], "if_open")]
 
 
 def test_the_configurations_of_the_extension_are_valid() -> None:

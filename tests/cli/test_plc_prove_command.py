@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
-from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from fieldtwin.gateway.core.files.yaml_file import parse
 
 ROOT = Path(__file__).parents[2]
@@ -51,6 +51,34 @@ def test_the_output_says_what_is_proved_and_what_is_violated(valve: Path) -> Non
     assert lines[4].split() == ["1", "T#1ms", "TRUE", "FALSE", "0.0"]
     assert lines[5] == "    then drive = TRUE"
     assert lines[6] == "  PROVED for all scans: no scan ends with an error"
+
+
+PUMPS = """PROGRAM Pump
+VAR lamp AT %Q* : BOOL; limit : INT := 1; END_VAR
+  lamp := limit > 15;
+END_PROGRAM
+CONFIGURATION Plant
+  RESOURCE Res0 ON PLC
+    PROGRAM east : Pump; PROGRAM west : Pump;
+  END_RESOURCE
+  VAR_CONFIG
+    Res0.east.lamp AT %QX0.0 : BOOL; Res0.east.limit : INT := 10;
+    Res0.west.lamp AT %QX0.1 : BOOL; Res0.west.limit : INT := 20;
+  END_VAR
+END_CONFIGURATION
+"""
+
+
+def test_each_program_of_a_configuration_is_proved_with_its_own_values(tmp_path: Path) -> None:
+    path = tmp_path / "pumps.st"
+    path.write_text(PUMPS)
+    assert prove(path, "--program", "east", "--invariant", "NOT lamp")[0] == 0
+    assert prove(path, "--program", "west", "--invariant", "NOT lamp")[0] == 1
+    with pytest.raises(FileInvalid, match="which program of the configuration is meant"):
+        prove(path, "--program", "Pump", "--invariant", "NOT lamp")
+    path.write_text(PUMPS.replace("%QX0.1", "%QX0.0"))
+    with pytest.raises(FileInvalid, match=r"west may change the global variable %QX0\.0"):
+        prove(path, "--program", "east", "--invariant", "NOT lamp")
 
 
 def test_exit_code_0_means_that_all_invariants_are_proved(valve: Path) -> None:

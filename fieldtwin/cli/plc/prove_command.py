@@ -199,7 +199,7 @@ def _prove_file(
     question = Question(
         unit.source, str(source[0]), kind.__name__, source[1],
         (*invariants.items(), *map(named, wanted.invariants)), (*assumptions.items(), *map(named, wanted.assumptions)),
-        (round(shortest * NS_PER_MS), round(longest * NS_PER_MS)),
+        (round(shortest * NS_PER_MS), round(longest * NS_PER_MS)), instance=program,
     )  # fmt: skip
     return prove(question, Limits(wanted.scans, lambda: (end_ns - WallClock().monotonic_ns()) / 1e9))
 

@@ -12,6 +12,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.image.image import TagKind
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
+from fieldtwin.plc.st.compiler.configurations.instances import declared_name
 from fieldtwin.plc.st.dialects import STANDARD, Dialect
 from fieldtwin.plc.st.model_checking.execution.mailboxes import MOST_MESSAGES
 from fieldtwin.plc.st.model_checking.properties import Asked, Expression, State, asked
@@ -31,7 +32,8 @@ class Question:
     """A question about a program of a unit.
 
     `invariants` and `assumptions` are names with expressions over the variables of the program. The time between two scans is
-    any time from `interval_ns[0]` to `interval_ns[1]`.
+    any time from `interval_ns[0]` to `interval_ns[1]`. `instance` is the program of a configuration that is meant, if there are
+    several of the PROGRAM.
     """
 
     unit: t.SourceUnit
@@ -42,6 +44,7 @@ class Question:
     assumptions: tuple[tuple[str, str], ...] = ()
     interval_ns: tuple[int, int] = (1_000_000, 3_600_000_000_000)
     states: bool = True
+    instance: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +126,7 @@ def prove(question: Question, limits: Limits) -> Report:
         question.unit, question.program, question.path, question.dialect, question.invariants, question.assumptions
     )
     _refuse_shared(question, found.unit)
-    kind = program_class(found.unit, question.program)
+    kind = program_class(found.unit, question.instance or question.program)
     return _Proof(question, found, kind).report(limits)
 
 
@@ -141,6 +144,15 @@ def _refuse_shared(question: Question, compiled: CompiledUnit) -> None:
             path=shared.pos.path, line=shared.pos.line, column=shared.pos.column,
             hint="pass values between programs through their inputs and outputs",
         )  # fmt: skip
+    own = [one.name for one in compiled.instances if declared_name(one.program).lower() == question.program.lower()]
+    if len(own) > 1 and compiled.globals:
+        other = next(name for name in own if name.lower() != question.instance.lower())
+        variable = next(iter(compiled.globals.values())).name
+        raise FileInvalid(
+            f"plc prove examines one program, and {other} may change the global variable {variable}",
+            path=question.path,
+            hint="pass values between programs through their inputs and outputs, and give each its own addresses",
+        )
 
 
 class _Proof:

@@ -1,4 +1,4 @@
-"""`fieldtwin profile`: what it writes and prints, and what it refuses."""
+"""`fieldtwin profile`: its files and output, and the inputs that it refuses."""
 
 from __future__ import annotations
 

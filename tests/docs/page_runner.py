@@ -179,7 +179,7 @@ class Reader:
 
 
 def main() -> int:
-    """Execute every page with nothing but an installation (scripts/walk). Return 1 if a page shows wrong output."""
+    """Execute every page with only an installation (scripts/walk). Return 1 if a page shows wrong output."""
     wrong = 0
     for page in sorted((ROOT / "docs").rglob("*.md")):
         if not (todo := blocks(page)):

@@ -1,4 +1,4 @@
-"""Tokens in files: what is a token, errors with the path, and no error that shows the token."""
+"""Tokens in files: the form of a token, errors with the path, and no error that shows the token."""
 
 from __future__ import annotations
 

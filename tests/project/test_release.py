@@ -1,4 +1,4 @@
-"""`scripts/release`: what it refuses, and a dry run that builds and tries everything."""
+"""`scripts/release`: the states that it refuses, and a dry run that builds and tries everything."""
 
 from __future__ import annotations
 

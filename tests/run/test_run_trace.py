@@ -67,7 +67,7 @@ def test_pending_events_are_in_the_sink_after_closing() -> None:
 
 def test_memory_is_bounded_whatever_an_event_holds() -> None:
     trace = Trace(5)
-    trace.note(0, TraceKind.NOTE, "a bug of ours", {"text": object()})
+    trace.note(0, TraceKind.NOTE, "a bug in fieldtwin", {"text": object()})
     for event in some(254):
         trace.note(*event)
     with pytest.raises(TypeError):

@@ -1,4 +1,4 @@
-"""Traces of virtual runs in Studio's interface: what it says of an instant is what the lines of the trace say."""
+"""Traces of virtual runs in Studio's interface: its values at an instant are those in the lines of the trace."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Twins in Studio's interface: the model beside the plant, the thread, decisions, and forecasts of the real command."""
+"""Twins in Studio's interface: the model compared with the plant, the thread, decisions, and forecasts of the real command."""
 
 from __future__ import annotations
 

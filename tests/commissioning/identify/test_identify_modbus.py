@@ -50,7 +50,7 @@ def levels(found: ModbusIdentity) -> dict[str, Sureness]:
 
 @pytest.mark.parametrize("name", RECORDED)
 def test_a_shipped_device_is_matched_with_its_own_profile_first(name: str) -> None:
-    """A replayed device has no identity of its own, so nothing may be certain, except if a SunSpec map identifies it."""
+    """A replayed device has no separate identity, so nothing may be certain, except if a SunSpec map identifies it."""
 
     async def main() -> None:
         profile = next(p for p in SHIPPED if Path(p.path).stem == name)

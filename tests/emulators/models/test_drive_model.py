@@ -88,7 +88,7 @@ class Rig:
         return found[0]
 
     def bring_to(self, state: DriveState) -> None:
-        """Go by the shortest path, from SWITCH ON DISABLED."""
+        """Take the shortest path from SWITCH ON DISABLED."""
         ways = {
             S.SWITCH_ON_DISABLED: [], S.READY: [SHUTDOWN], S.SWITCHED_ON: [SHUTDOWN, SWITCH_ON],
             S.OPERATION_ENABLED: [SHUTDOWN, SWITCH_ON, ENABLE], S.QUICK_STOP: [SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP],

@@ -354,7 +354,7 @@ def test_a_slow_scrape_is_ended_and_others_are_served(monkeypatch: pytest.Monkey
 
 
 def test_answers_without_an_end_do_not_prolong_a_call() -> None:
-    """A process that answers other requests for ever: the call ends at its timeout."""
+    """A process that answers other requests forever: the call ends at its timeout."""
 
     async def main() -> None:
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -471,7 +471,7 @@ def test_a_block_upload_that_drips_ends_within_its_limit() -> None:
 
 
 def test_an_object_of_known_length_is_not_read_beyond_it() -> None:
-    """A tag has a type, and thus a length: a node that sends a byte every 50 ms for ever is stopped after a few seconds."""
+    """A tag has a type, and thus a length: a node that sends a byte every 50 ms forever is stopped after a few seconds."""
     made, now_ns = SdoUpload(5, 0x2000, 0, TIMEOUT, length=4), 0
     made.start(now_ns)
     step = made.feed(CanFrame(0x585, b"\x40" + MUX + bytes(4)), now_ns)

@@ -1,6 +1,6 @@
 """Endless logic: a limit per scan in Structured Text, in real and in virtual time, and signals in virtual time.
 
-Defect: an endless loop blocked a run in virtual time for ever, and SIGTERM did not end it.
+Defect: an endless loop blocked a run in virtual time forever, and SIGTERM did not end it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Run rows of canopen_slave.toml without threads on LocalNode, the node of the `canopen` package, in place of ours.
+"""Run rows of canopen_slave.toml without threads on LocalNode, the node of the `canopen` package, in place of the emulated node.
 
 It has hardly any timers (its heartbeat is a thread of python-can), so only the order of frames is checked.
 """

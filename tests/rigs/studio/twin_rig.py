@@ -1,4 +1,4 @@
-"""The observatory's prototype with a digital thread, a twin opposite it, and a Studio that shows both."""
+"""The observatory's prototype with a digital thread, a twin that is connected to it, and a Studio that shows both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A debugger that is attached to a running prototype: stops in a scan, what the field and the gateway see, and the end."""
+"""A debugger that is attached to a running prototype: stops in a scan, their effects on the simulated devices, and the end."""
 
 from __future__ import annotations
 

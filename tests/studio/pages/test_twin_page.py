@@ -1,4 +1,4 @@
-"""The view Twin in a real Chromium: a twin that follows the plant, its decisions, and a forecast beside the history."""
+"""The view Twin in a real Chromium: a twin that follows the plant, its decisions, and a forecast after the history."""
 
 from __future__ import annotations
 

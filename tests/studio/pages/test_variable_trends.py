@@ -1,4 +1,4 @@
-"""Trends of program variables beside tags, in a real Chromium: units, names of values, and the number of scans that are shown."""
+"""Trends of program variables and tags in a real Chromium: units, names of values, and the number of scans that are shown."""
 
 from __future__ import annotations
 

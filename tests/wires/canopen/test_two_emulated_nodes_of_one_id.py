@@ -1,4 +1,4 @@
-"""Two `fieldtwin emulate` processes with one node ID on a software bus: each prints that the other one is there.
+"""Two `fieldtwin emulate` processes with one node ID on a software bus: each prints that the other one exists.
 
 Defect: both answered every request, and neither printed anything; only an EMCY on the bus (8150h) showed the collision.
 """

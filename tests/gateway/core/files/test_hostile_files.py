@@ -1,6 +1,6 @@
 """Hostile files end in a typed error, within limits on memory and time, for every kind of file.
 
-Defects: a pipe blocked every reader for ever, /dev/zero and a file of 1 GB filled the memory as an EDS, as Structured Text, as
+Defects: a pipe blocked every reader forever, /dev/zero and a file of 1 GB filled the memory as an EDS, as Structured Text, as
 a CAN log and as the file of `run`, and an integer of 5000 digits in a YAML file ended in a traceback.
 """
 

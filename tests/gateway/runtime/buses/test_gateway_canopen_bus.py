@@ -174,7 +174,7 @@ def test_without_permission_the_mapping_is_adopted_and_nothing_is_written(tmp_pa
 
 
 def test_a_read_only_plant_reads_tags_over_sdo_that_the_nodes_tpdo_does_not_carry(tmp_path: Path) -> None:
-    """Defect: the mapping of `tpdo1` may not be written, so that no message brought the tag, and programs waited for ever."""
+    """Defect: the mapping of `tpdo1` may not be written, so that no message brought the tag, and programs waited forever."""
 
     async def main() -> None:
         async with rig(tmp_path, allow_writes=False, serial="", tpdo1=Tpdo(("slope_long", "serial"), 20)) as r:

@@ -274,7 +274,7 @@ def test_a_slow_unit_stays_in_service_when_its_neighbours_fall_silent() -> None:
 
 @pytest.mark.parametrize("count", [2, 31])
 def test_a_half_open_connection_to_several_units_is_reopened(count: int) -> None:
-    """Defect: shortened timeouts did not count as unanswered requests, so such a connection was kept for ever."""
+    """Defect: shortened timeouts did not count as unanswered requests, so such a connection was kept forever."""
 
     async def main() -> None:
         def make(tags: TagTable) -> list[RegisterDriver]:

@@ -265,7 +265,7 @@ def test_a_node_that_restarts_is_mapped_and_commanded_again(tmp_path: Path, hear
             assert (r.field.held(0x6040), r.field.held(0x60FF)) == (6, 5)
             assert r.writer.rewrites == 0  # the boot-up reported it; no read was needed
             await r.field.power_off()
-            await asyncio.sleep(1)  # its heartbeat is missing: no write stays in transit for ever
+            await asyncio.sleep(1)  # its heartbeat is missing: no write stays in transit forever
             r.want(controlword=7)
             await asyncio.sleep(1)
             assert not any(o.pending for o in r.writer.outputs)

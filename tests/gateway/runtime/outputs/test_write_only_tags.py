@@ -75,7 +75,7 @@ def test_the_warning_is_shown_when_the_file_is_loaded(tmp_path: Path) -> None:
 
 
 def test_a_value_that_was_read_before_a_write_and_never_after_it_is_not_good(tmp_path: Path) -> None:
-    """Defect: it was shown as good for ever, with the value from before the write."""
+    """Defect: it was shown as good forever, with the value from before the write."""
     system = hall(tmp_path, mode=0)
     text = system.read_text().replace("    poll: {status: {every_ms: 500}}\n", "    expect: {speed: '3'}\n")
     system.write_text(text)

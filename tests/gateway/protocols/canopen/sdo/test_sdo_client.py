@@ -252,7 +252,7 @@ GARBAGE = st.one_of(
 
 @given(value=st.binary(max_size=40), sized=st.booleans(), data=st.data())
 def test_no_garbage_and_no_repetition_yields_a_wrong_object(value: bytes, sized: bool, data: st.DataObject) -> None:
-    """Between the correct frames: foreign frames, and repetitions of ours. The value is correct or there is an error."""
+    """Between the correct frames: foreign and repeated frames. The value is correct or there is an error."""
     parts = [value[i : i + 7] for i in range(0, len(value), 7)] or [b""]
     replies = [bytes([0x40 | sized, 0x08, 0x10, 0x00]) + (len(value) if sized else 0).to_bytes(4, "little")]
     for i, part in enumerate(parts):

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
+from os.path import realpath
 from pathlib import Path
 
 from fieldtwin.gateway.core.errors import FileInvalid
@@ -74,10 +75,10 @@ def read_with(
 
 def source_texts(paths: tuple[Path, ...]) -> Texts:
     """Return the files of several sources with their content, each file once. Raises `FileInvalid`."""
-    files: dict[Path, Path] = {}
+    files: dict[str, Path] = {}
     for path in paths:
         for file in source_files(path):
-            files.setdefault(file.resolve(), file)
+            files.setdefault(realpath(file), file)  # unlike Path.resolve, no error for a link to itself
     return tuple((str(file), _text(file)) for file in files.values())
 
 

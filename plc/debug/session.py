@@ -58,6 +58,8 @@ class Session:
         """By file: the bodies of its POUs."""
         self._lines: dict[str, set[int]] = {}
         """By file: the lines at which a program can stop."""
+        self.then: Callable[[], None] | None = None
+        """Lets the program go on, after the response to the request: an event of the program must not come before it."""
         self._handles: list[tuple[StoppedFrame, Variable | str]] = []
         """The things that the editor may list: a scope ("local" or "global"), or a variable with parts. The number of a handle is
         its place here, from 1.
@@ -92,6 +94,9 @@ class Session:
         except (KeyError, TypeError, ValueError) as e:
             answer |= _failure(f"the arguments of {command}: {type(e).__name__}: {e}")
         self.send("response", **answer)
+        then, self.then = self.then, None
+        if then is not None:
+            then()
         if command in ("launch", "attach") and answer["success"]:
             self.send("event", event="initialized")
 
@@ -275,7 +280,7 @@ class Session:
         if not self.tracer.frames:
             raise UsageError("the program is not stopped")
         self._handles.clear()
-        self._resume_program(how)
+        self.then = lambda: self._resume_program(how)
 
     def do_continue(self, given: dict[str, Any]) -> dict[str, Any]:
         self._resume(Resume.CONTINUE)

@@ -79,7 +79,7 @@ class Adapter(Session):
 
     def do_configurationDone(self, given: dict[str, Any]) -> None:
         self._thread = threading.Thread(target=self._run, name="debugged program", daemon=True)
-        self._thread.start()
+        self.then = self._thread.start
 
     def _run(self) -> None:
         well = False
@@ -96,7 +96,7 @@ class Adapter(Session):
         self.send("event", event="terminated")
 
     def do_terminate(self, given: dict[str, Any]) -> None:
-        self._end_program()
+        self.then = self._end_program
 
     def do_disconnect(self, given: dict[str, Any]) -> None:
         self._ended = True

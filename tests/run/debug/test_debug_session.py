@@ -119,6 +119,26 @@ def test_a_step_into_a_block_stops_at_its_first_statement(editor: ProcessEditor,
     assert editor.ends() == 0
 
 
+def test_the_answer_to_a_step_comes_before_its_stop(project: Path, opened: Open) -> None:
+    """Kate takes a program for running if the answer comes after the stop."""
+    (project / "long.test.st").write_text(
+        "TEST 'long'\nVAR n : DINT; END_VAR\n  WHILE n < 1000 DO\n    n := n + 1;\n  END_WHILE\nEND_TEST\n"
+    )
+    editor = opened(str(project / "long.test.st"))
+    editor.begin({}, stopOnEntry=True)
+    early = len(editor.events)
+    editor.wait("stopped")
+    for command in ("next", "stepIn") * 150:
+        editor.ask(command, threadId=1)
+        early += len(editor.events)
+        editor.wait("stopped")
+    assert early == 0
+    editor.ask("terminate")
+    assert not editor.events
+    editor.wait("terminated")
+    assert editor.ends() == 0
+
+
 def test_a_step_over_a_call_executes_the_whole_line(editor: ProcessEditor, project: Path) -> None:
     editor.begin({project / "counter.test.st": [4]})  # a call with an argument: several instructions in one line
     editor.wait("stopped")

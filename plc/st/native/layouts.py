@@ -24,6 +24,8 @@ _GLOBAL = ("bool", "int", "float", "block")
 """The kinds of global variables that have a place in a structure."""
 SIMPLE = ("bool", "int", "float")
 """The kinds of variables without parts."""
+ROW = (*SIMPLE, "optional")
+"""The kinds of variables that are in the row of a structure."""
 STANDARD = "T_"
 """The beginning of the names of the structures of standard function blocks."""
 
@@ -59,8 +61,35 @@ class Layout:
 
     name: str
     fields: dict[str, Field] = field(default_factory=dict)
+    slots: tuple[str, ...] = ()
+    """The slots of the Python class in the order of their memory; empty for the class of the global variables, which has none."""
     methods: dict[str, ast.FunctionDef] = field(default_factory=dict)
     constants: Mapping[str, object] = field(default_factory=dict)
+
+    def row(self) -> list[Field | None]:
+        """Return the variables without parts in the order of their memory; None for a slot between them that is none of them."""
+        if not self.slots:
+            return [one for one in self.fields.values() if one.kind in ROW]
+        found = [self.fields.get(name) for name in self.slots]
+        kept = [one if one is not None and one.kind in ROW else None for one in found]
+        used = [n for n, one in enumerate(kept) if one is not None]
+        return kept[used[0] : used[-1] + 1] if used else []
+
+    def parts(self) -> list[Field]:
+        """Return the blocks and arrays, and after them the records that have values."""
+        found = [one for one in self.fields.values() if one.kind in ("block", "blocks", "array")]
+        return found + [one for one in self.fields.values() if one.kind == "lines" or (one.kind == "line" and one.values)]
+
+    def lines(self) -> list[Field]:
+        """Return the records without values."""
+        return [one for one in self.fields.values() if one.kind == "line" and not one.values]
+
+
+def slots_of(node: ast.ClassDef) -> list[str]:
+    """Return the attributes that the methods of the class of a PROGRAM set, which become its slots."""
+    set_in = [each for each in ast.walk(node) if isinstance(each, ast.Attribute) and isinstance(each.ctx, ast.Store)]
+    own = [each.attr for each in set_in if isinstance(each.value, ast.Name) and each.value.id == "self"]
+    return list(dict.fromkeys(own))
 
 
 class Layouts:
@@ -87,7 +116,7 @@ class Layouts:
         node = self._classes.get(name)
         if node is None:
             raise Unsupported(f"class {name}")
-        made = Layout(name)
+        made = Layout(name, slots=_slots(node))
         made.methods = {each.name: each for each in node.body if isinstance(each, ast.FunctionDef)}
         for target, value in _assigned(made.methods.get("__init__")):
             found = self._field(target, value)
@@ -154,7 +183,9 @@ class Layouts:
         constants = {}
         for base in reversed(block.__mro__):
             constants.update({key: value for key, value in vars(base).items() if isinstance(value, int)})
-            for slot in vars(base).get("__slots__", ()):
+            own = sorted(vars(base).get("__slots__", ()))
+            made.slots += tuple(own)
+            for slot in own:
                 value = getattr(new, slot)
                 kind = "optional" if value is None else _kind(ast.Constant(value))
                 if not kind:
@@ -176,6 +207,14 @@ class Layouts:
         for name in _lines_in(ast.Module(body, []), "_G"):
             made.fields[name] = Field(name, "line")
         return made
+
+
+def _slots(node: ast.ClassDef) -> tuple[str, ...]:
+    """Return the slots of a class in the order of their memory: CPython sorts the slots of one class by their names."""
+    for each in node.body:
+        if isinstance(each, ast.Assign) and ast.unparse(each.targets[0]) == "__slots__":
+            return tuple(sorted(ast.literal_eval(each.value)))
+    return tuple(sorted(slots_of(node)))
 
 
 def _assigned(init: ast.FunctionDef | None) -> Iterator[tuple[str, ast.expr]]:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
-from fieldtwin.plc.st.native.expressions import c_type
 from fieldtwin.plc.st.native.layouts import Field, Layout
 from fieldtwin.plc.st.native.statements import Translation
+from fieldtwin.plc.st.runtime.context import Context
 
 MODULE = "fieldtwin_machine_code"
 _KINDS = {"bool": "BOOL", "int": "INT", "float": "FLOAT", "optional": "OPTIONAL"}
-_CONTEXT = Layout("Context", {name: Field(name, "int") for name in ("now_ns", "left", "scan")})
+_CONTEXT = Layout("Context", {name: Field(name, "int") for name in ("now_ns", "left", "scan")}, tuple(sorted(Context.__slots__)))
 _CONTEXT.fields["first_scan"] = Field("first_scan", "bool")
-_ORDER = ("bool", "int", "float", "optional", "array", "block", "blocks", "line", "lines")
-"""The order of the variables in a structure: a loop over variables of one kind is faster."""
 _FIRST = 2
 """The number of the first class after the context and the global variables."""
 
@@ -46,15 +44,15 @@ class ModuleText:
         self._objects: dict[str, int] = {}
         """By structure: the number of Python objects that its variables are."""
         for layout in (*self.classes, self._globals, _CONTEXT):
-            layout.fields = dict(sorted(layout.fields.items(), key=lambda item: _ORDER.index(item[1].kind)))
-            self._objects[layout.name] = sum(self._objects_of(one) for one in layout.fields.values())
+            parts = sum(self._objects_of(one) for one in layout.parts())
+            self._objects[layout.name] = len(layout.row()) + parts
 
     def _objects_of(self, one: Field) -> int:
         if one.kind == "block":
             return self._objects[one.of]
         if one.kind == "blocks":
             return one.size * self._objects[one.of]
-        return one.size if one.kind == "array" else 0 if one.kind in ("line", "lines") else 1
+        return one.size if one.kind == "array" else 0
 
     def text(self) -> str:
         blocks = len(self._translation.structures)
@@ -62,7 +60,7 @@ class ModuleText:
         parts = [
             files("fieldtwin.plc.st.native").joinpath("runtime.h").read_text(encoding="ascii"),
             *(self._structure(layout) for layout in layouts),
-            *(self._entries(layout) for layout in layouts),
+            *(self._class(layout) for layout in layouts),
             self._tables(),
             *self._translation.texts,
             *(self._run(run) for run in self._runs),
@@ -71,64 +69,70 @@ class ModuleText:
         return "\n".join(parts)
 
     def _structure(self, layout: Layout) -> str:
-        members = "".join(f"  {_member(one)};\n" for one in layout.fields.values())
-        return f"struct S_{layout.name} {{\n  PyObject *object;\n{members}}};\n"
+        row = "".join(
+            f"  {_of_kind(one.kind)} {one.c_name};\n" if one else f"  int64_t gap_{n};\n"
+            for n, one in enumerate(layout.row())
+        )
+        others = "".join(f"  {_member(one)};\n" for one in (*layout.parts(), *layout.lines()))
+        return f"struct S_{layout.name} {{\n  PyObject *object;\n{row}{others}}};\n"
 
-    def _entries(self, layout: Layout) -> str:
-        entries, objects = "", 0
-        for one in layout.fields.values():
-            entries += f"  {self._entry(layout, one, objects)},\n"
+    def _class(self, layout: Layout) -> str:
+        """Return the tables of a class: the kinds of its row, its parts, its names, and a table for its slots."""
+        row, parts, lines = layout.row(), layout.parts(), layout.lines()
+        kinds = "".join(f"{_KINDS[one.kind] if one else 'NOTHING'}, " for one in row)
+        table, objects = "", len(row)
+        for one in parts:
+            table += f"  {self._part(layout, one, objects)},\n"
             objects += self._objects_of(one)
-        names = "".join(f'"{name}", ' for name in layout.fields)
+        names = "".join(f'"{one.name if one else ""}", ' for one in (*row, *parts, *lines))
         return (
-            f"static const struct Entry E_{layout.name}[] = {{\n{entries}  {{0}}\n}};\n"
+            f"static const uint8_t K_{layout.name}[] = {{{kinds}0}};\n"
+            f"static const struct Part P_{layout.name}[] = {{\n{table}  {{0}}\n}};\n"
             f"static const char *const N_{layout.name}[] = {{{names}NULL}};\n"
-            f"static Py_ssize_t O_{layout.name}[{len(layout.fields) + 1}];\n"
+            f"static Py_ssize_t O_{layout.name}[{len(row) + len(parts) + len(lines) + 1}];\n"
         )
 
-    def _entry(self, layout: Layout, one: Field, objects: int) -> str:
-        kind, of, block = _KINDS.get(one.kind, one.kind.upper()), "0", "0"
-        if one.kind in ("block", "blocks"):
-            block = str(self._numbers[one.of])
-        elif one.kind == "array":
-            of = _KINDS[one.of]
-        elif one.kind == "line" and one.values:
-            kind = "RECORD"
+    def _part(self, layout: Layout, one: Field, objects: int) -> str:
+        kind = "RECORD" if one.kind == "line" else one.kind.upper()
+        of = _KINDS[one.of] if one.kind == "array" else "0"
+        block = self._numbers[one.of] if one.kind in ("block", "blocks") else 0
         return f"{{{kind}, {of}, {block}, {one.size}, {objects}, offsetof(struct S_{layout.name}, {one.c_name})}}"
 
     def _tables(self) -> str:
         layouts = [_CONTEXT, self._globals, *self.classes]
-        rows = "".join(f"  {{{self._row(one)}}},\n" for one in layouts)
+        rows = "".join(f"  {{{self._entry(one)}}},\n" for one in layouts)
         return f"static const struct Class TABLE[] = {{\n{rows}}};\nenum {{ COUNT = {len(layouts)} }};\n"
 
-    def _row(self, of: Layout) -> str:
-        tables = f"E_{of.name}, N_{of.name}, O_{of.name}"
-        return f"{_values(of)}, {len(of.fields)}, {self._objects[of.name]}, sizeof(struct S_{of.name}), {tables}"
+    def _entry(self, of: Layout) -> str:
+        parts, lines = of.parts(), of.lines()
+        counts = f"{len(of.row())}, {_read(parts)}, {len(parts)}, {len(lines)}, {self._objects[of.name]}"
+        first_line = f"offsetof(struct S_{of.name}, {lines[0].c_name})" if lines else "0"
+        tables = ", ".join(f"{table}_{of.name}" for table in "KPNO")
+        return f"{counts}, sizeof(struct S_{of.name}), {first_line}, {tables}"
 
     def _run(self, run: Run) -> str:
         name, layout = run.c_name, run.layout
-        uses = {
-            owner: [n for n, attribute in enumerate(of.fields) if (owner, attribute) in run.used]
-            for owner, of in (("self", layout), ("_G", self._globals))
-        }
-        values = sum(1 for n in uses["self"] if n < _values(layout))
         number, objects = self._numbers[layout.name], max(self._objects[layout.name], 1)
         shared = max(self._objects["globals"], 1)
+        in_context = len(_CONTEXT.row())
         return f"""
-static const int U_{name}[] = {{{", ".join(map(str, [*uses["self"], 0]))}}};
-static const int UG_{name}[] = {{{", ".join(map(str, [*uses["_G"], 0]))}}};
+{_use(f"U_{name}", layout, {attribute for owner, attribute in run.used if owner == "self"})}
+{_use(f"UG_{name}", self._globals, {attribute for owner, attribute in run.used if owner == "_G"})}
 static PyObject *run_{name}(PyObject *capsule, PyObject *const *given, Py_ssize_t count) {{
   static struct S_{layout.name} now, old;
   static struct S_globals g_now, g_old;
   static struct S_Context c_now, c_old;
-  static PyObject *objects[{objects}], *g_objects[{shared}], *c_objects[{len(_CONTEXT.fields)}];
+  static PyObject *objects[{objects}], *g_objects[{shared}], *c_objects[{in_context}];
   const struct Values s = {{(char *)&now, (char *)&old, objects}}, g = {{(char *)&g_now, (char *)&g_old, g_objects}};
   const struct Values c = {{(char *)&c_now, (char *)&c_old, c_objects}};
   const struct Bound *b = PyCapsule_GetPointer(capsule, "{MODULE}");
   if (b == NULL || count != 3) return NULL;
-  if (load(b, 0, NULL, {len(_CONTEXT.fields)}, given[1], &c)
-      || load(b, {number}, U_{name}, {values}, given[0], &s)
-      || load_globals(b, UG_{name}, {len(uses["_G"])}, given[2], &g)) Py_RETURN_NONE;
+  if (objects[0] == NULL) {{
+    forget(&s, sizeof now, {objects});
+    forget(&g, sizeof g_now, {shared});
+    forget(&c, sizeof c_now, {in_context});
+  }}
+  if (load(b, 0, NULL, given[1], &c) || load(b, {number}, &U_{name}, given[0], &s) || load_globals(b, &UG_{name}, given[2], &g)) Py_RETURN_NONE;
   int result = {name}(&now, &c_now, &g_now);
   if (result != 1) {{
     int64_t scan = c_now.f_scan;
@@ -136,9 +140,8 @@ static PyObject *run_{name}(PyObject *capsule, PyObject *const *given, Py_ssize_
     struct Publication p;
     int is_published = published && PyTuple_CheckExact(published);
     if (is_published) p = (struct Publication){{PyTuple_GET_ITEM(published, 0), PyTuple_GET_ITEM(published, 1)}};
-    if (published && store({number}, U_{name}, {len(uses["self"])}, given[0], &s, scan, is_published ? &p : NULL) == 0
-        && store_globals(UG_{name}, {len(uses["_G"])}, given[2], &g, scan) == 0
-        && store(0, NULL, {len(_CONTEXT.fields)}, given[1], &c, scan, NULL) == 0
+    if (published && store({number}, &U_{name}, given[0], &s, scan, is_published ? &p : NULL) == 0
+        && store_globals(&UG_{name}, given[2], &g, scan) == 0 && store(0, NULL, given[1], &c, scan, NULL) == 0
         && (!is_published || PyObject_SetAttrString(given[1], "published", Py_None) == 0)) {{
       Py_DECREF(published);
       return PyBool_FromLong(result == 2);
@@ -147,7 +150,7 @@ static PyObject *run_{name}(PyObject *capsule, PyObject *const *given, Py_ssize_
   }}
   forget(&s, sizeof now, {objects});
   forget(&g, sizeof g_now, {shared});
-  forget(&c, sizeof c_now, {len(_CONTEXT.fields)});
+  forget(&c, sizeof c_now, {in_context});
   if (result != 1) return NULL;
   Py_RETURN_NONE;
 }}
@@ -178,16 +181,18 @@ static PyObject *bind(PyObject *module, PyObject *given) {{
     PyObject *type = PyTuple_GET_ITEM(types, n);
     if (type == Py_None) continue;
     b->types[n] = (PyTypeObject *)Py_NewRef(type);
-    for (int k = 0; k < TABLE[n].count; k++) {{
+    for (int k = 0; k < TABLE[n].row + TABLE[n].parts + TABLE[n].lines; k++) {{
+      Py_ssize_t *slot = &TABLE[n].slots[k];
+      if (!*TABLE[n].names[k]) {{ *slot = slot[-1] + (Py_ssize_t)sizeof(PyObject *); continue; }}
       PyObject *found = PyObject_GetAttrString(type, TABLE[n].names[k]);
       if (found == NULL) return NULL;
       PyMemberDef *member = Py_IS_TYPE(found, &PyMemberDescr_Type) ? ((PyMemberDescrObject *)found)->d_member : NULL;
-      if (member == NULL || member->type != T_OBJECT_EX) {{
-        PyErr_Format(PyExc_TypeError, "%s is not a slot", TABLE[n].names[k]);
+      if (member) *slot = member->offset;
+      Py_DECREF(found);
+      if (!member || member->type != T_OBJECT_EX || (0 < k && k < TABLE[n].row && *slot != slot[-1] + (Py_ssize_t)sizeof(PyObject *))) {{
+        PyErr_Format(PyExc_TypeError, "%s is not the expected slot", TABLE[n].names[k]);
         return NULL;
       }}
-      TABLE[n].slots[k] = member->offset;
-      Py_DECREF(found);
     }}
   }}
   if (CONSTANTS == NULL) {{
@@ -207,9 +212,28 @@ PyMODINIT_FUNC PyInit_{MODULE}(void) {{ return PyModule_Create(&DEFINITION); }}
 """
 
 
-def _values(layout: Layout) -> int:
-    """Return how many fields have values; the others, which come after them, are records."""
-    return sum(one.kind not in ("line", "lines") for one in layout.fields.values())
+def _use(name: str, layout: Layout, used: set[str]) -> str:
+    """Return the C table of the variables of a structure that a run uses."""
+    row, parts, lines = (
+        [n for n, one in enumerate(found) if one and one.name in used]
+        for found in (layout.row(), layout.parts(), layout.lines())
+    )
+    read = _read(layout.parts()[n] for n in parts)
+    numbers = ", ".join(map(str, [*row, *parts, *lines, 0]))
+    return (
+        f"static const int N_{name}[] = {{{numbers}}};\n"
+        f"static const struct Use {name} = {{{len(row)}, {read}, {len(parts)}, {len(lines)}, N_{name}}};"
+    )
+
+
+def _read(parts: Iterable[Field]) -> int:
+    """Return how many parts are read; the others, which come after them, are records."""
+    return sum(one.kind not in ("line", "lines") for one in parts)
+
+
+def _of_kind(kind: str) -> str:
+    """Return the C type of a variable in a structure, which always has 8 bytes."""
+    return "double" if kind == "float" else "int64_t"
 
 
 def _member(one: Field) -> str:
@@ -218,10 +242,8 @@ def _member(one: Field) -> str:
     if one.kind == "blocks":
         return f"struct S_{one.of} {one.c_name}[{one.size}]"
     if one.kind == "array":
-        return f"{c_type(one.of)} {one.c_name}[{one.size}]"
+        return f"{_of_kind(one.of)} {one.c_name}[{one.size}]"
     if one.kind == "line":
         return f"struct {'Record' if one.values else 'Line'} {one.c_name}"
-    if one.kind == "lines":
-        size = max(one.size, 1)
-        return f"struct {{ int32_t count; int32_t at[{size}]; struct Record records[{size}]; }} {one.c_name}"
-    return f"{c_type(one.kind)} {one.c_name}"
+    size = max(one.size, 1)
+    return f"struct {{ int32_t count; int32_t at[{size}]; struct Record records[{size}]; }} {one.c_name}"

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from fieldtwin.plc.st.native.layouts import Layout, Layouts, Unsupported
+from fieldtwin.plc.st.native.layouts import Layout, Layouts, Unsupported, slots_of
 from fieldtwin.plc.st.native.module_text import ModuleText, Run
 from fieldtwin.plc.st.native.statements import Translation
 
@@ -41,7 +41,7 @@ class Prepared:
     statements: dict[str, int] = field(default_factory=dict)
     """By class of a PROGRAM: the number of its lines with statements, each with the statements inside it."""
     published: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """By class of a PROGRAM that is machine code as a whole: its attributes in the order of the C structure."""
+    """By class of a PROGRAM that is machine code as a whole: the attributes in the row of its structure; "" between them."""
 
 
 def prepare(body: list[ast.stmt]) -> Prepared:
@@ -62,7 +62,7 @@ def prepare(body: list[ast.stmt]) -> Prepared:
     module = ModuleText(translation, runs)
     constants = tuple(ast.literal_eval(each) for each in translation.constants)
     whole = [name for name, left in kept.items() if not left and sum(run.layout.name == name for run in runs) == 1]
-    published = {name: tuple(layouts.of(name).fields) for name in whole}
+    published = {name: tuple(one.name if one else "" for one in layouts.of(name).row()) for name in whole}
     classes = tuple(one.name for one in module.classes)
     return Prepared(module.text(), classes, constants, len(runs), kept, statements, published)
 
@@ -85,7 +85,8 @@ def _translate(node: ast.ClassDef, layout: Layout, translation: Translation, run
         runs.append(Run(c_name, layout, frozenset(used)))
     if any(run.layout is layout for run in runs):
         execute.body = made
-        names = ast.Tuple([ast.Constant(name) for name in _attributes(node)], ast.Load())
+        # The run-time library sets further attributes, which go to the dictionary.
+        names = ast.Tuple([ast.Constant(name) for name in (*slots_of(node), "__dict__")], ast.Load())
         slots = ast.Assign([ast.Name("__slots__", ast.Store())], names)
         node.body.insert(0, ast.copy_location(slots, node))
         ast.fix_missing_locations(node)
@@ -95,13 +96,6 @@ def _written(reason: str) -> str:
     """Return a reason with the names of variables as the source writes them."""
     text = re.sub(r"\b(self\.)?(v_|_v\.)", "", reason)
     return text if len(text) <= MAX_REASON else f"{text[:MAX_REASON]}..."
-
-
-def _attributes(node: ast.ClassDef) -> list[str]:
-    """Return the attributes that the methods of a class set, and the dictionary for those that the run-time library sets."""
-    set_in = [each for each in ast.walk(node) if isinstance(each, ast.Attribute) and isinstance(each.ctx, ast.Store)]
-    own = [each.attr for each in set_in if isinstance(each.value, ast.Name) and each.value.id == "self"]
-    return [*dict.fromkeys(own), "__dict__"]
 
 
 def _groups(

@@ -10,18 +10,32 @@
 #error "the compiler computes REAL with more digits than Python"
 #endif
 
-enum { BOOL, INT, FLOAT, OPTIONAL, BLOCK, BLOCKS, ARRAY, LINE, RECORD, LINES };
+enum { NOTHING, BOOL, INT, FLOAT, OPTIONAL, BLOCK, BLOCKS, ARRAY, RECORD, LINES };
 enum { MAX_VALUES = 8 };
 
-struct Line { int32_t code, count; };
-/* The record of an assignment by the statement of `maker`; NULL for a FUNCTION, which has no object. */
+/* The record of an assignment: 0 for none, -n for the constant number n. */
+struct Line { int32_t code; };
+/* The record of an assignment with values: also n for an assignment by the statement number n of `maker`; NULL for a FUNCTION, which has
+   no object. */
 struct Record { int32_t code, count; PyObject *maker; int64_t key; int64_t values[MAX_VALUES]; };
-/* A variable: `kind` and `of`, the kind of its elements; their number; its class, if it is a block; the number of its first Python
-   object; its place in the structure. Tables are read in each scan, so entries are small. */
-struct Entry { uint8_t kind, of; uint16_t block; uint32_t size, object, offset; };
-/* The first `values` entries have values; the others are records. `objects` is the number of Python objects that the values are, and
-   `size` that of the structure. */
-struct Class { int values, count, objects; size_t size; const struct Entry *entries; const char *const *names; Py_ssize_t *slots; };
+/* A block, an array, or a record with values: `kind` and `of`, the kind of its elements; their number; its class, if it is a block;
+   the number of its first Python object; its place in the structure. */
+struct Part { uint8_t kind, of; uint16_t block; uint32_t size, object, offset; };
+/* A class. Its structure begins with the Python object. Then comes the row of the variables without parts: numbers of 8 bytes in the order of
+   the slots of the Python object, which follow each other too, so that a scan compares them in short loops. A slot between them that is
+   not one of them has the kind NOTHING. After the row come `parts`, of which the first `read` are read, and `lines` records without
+   values, from `first_line`. `names` and `slots` are those of the row, the parts and the lines. `objects` is the number of Python
+   objects of all values, those of the row first. */
+struct Class {
+  int row, read, parts, lines, objects;
+  size_t size, first_line;
+  const uint8_t *kinds;
+  const struct Part *part;
+  const char *const *names;
+  Py_ssize_t *slots;
+};
+/* The variables that a run uses: numbers in the row, then of parts, then of lines. */
+struct Use { int row, read, parts, lines; const int *numbers; };
 /* The Python classes of one resource. */
 struct Bound { PyTypeObject **types; };
 /* The head of the records of the elements of an array. `at` has the number of the record of each element, from 1. */
@@ -29,7 +43,7 @@ struct Lines { int32_t count; int32_t at[]; };
 #define RECORDS(lines, size) ((struct Record *)((char *)(lines) + ((4 + 4 * (size_t)(size) + 7) & ~(size_t)7)))
 
 /* The variables of one object: `now` has the values with which machine code computes, `old` those of the Python object, and
-   `objects` the Python objects of the values. A variable that still is the same Python object is not read again. */
+   `objects` the Python objects of the values, or Ellipsis. A variable that still is the same Python object is not read again. */
 struct Values { char *now, *old; PyObject **objects; };
 
 static const struct Class *CLASSES;
@@ -41,6 +55,8 @@ static PyObject **CONSTANTS;
 #else
 #define FAST __attribute__((optimize("O2")))
 #endif
+#define ROW(of) ((int64_t *)((of) + sizeof(PyObject *)))
+#define SLOT(o, c, n) (*(PyObject **)((char *)(o) + (c)->slots[n]))
 #define WITHIN(s, e) ((struct Values){(s)->now + (e)->offset, (s)->old + (e)->offset, (s)->objects + (e)->object})
 #define ELEMENT(s, e, at) ((struct Values){ \
     (s)->now + (e)->offset + (at) * CLASSES[(e)->block].size, (s)->old + (e)->offset + (at) * CLASSES[(e)->block].size, \
@@ -111,7 +127,7 @@ static inline struct Record *record_at(struct Lines *lines, int size, int64_t ke
   return r;
 }
 
-static inline int load_value(int kind, PyObject *v, char *to) {
+static inline int load_value(int kind, PyObject *v, int64_t *to) {
   if (v == NULL) return 1;
   switch (kind) {
     case BOOL:
@@ -124,86 +140,81 @@ static inline int load_value(int kind, PyObject *v, char *to) {
       return 0;
     default: {
       int overflow = 0;
-      if (kind == OPTIONAL && v == Py_None) { *(int64_t *)to = INT64_MIN; return 0; }
+      if (kind == OPTIONAL && v == Py_None) { *to = INT64_MIN; return 0; }
       if (!PyLong_CheckExact(v)) return 1;
 #if PY_VERSION_HEX < 0x030c0000
       if (Py_SIZE(v) >= -1 && Py_SIZE(v) <= 1) {  /* most integers; the function below is slower */
-        *(int64_t *)to = Py_SIZE(v) * (int64_t)((PyLongObject *)v)->ob_digit[0];
+        *to = Py_SIZE(v) * (int64_t)((PyLongObject *)v)->ob_digit[0];
         return 0;
       }
 #else
       if (PyUnstable_Long_IsCompact((PyLongObject *)v)) {
-        *(int64_t *)to = PyUnstable_Long_CompactValue((PyLongObject *)v);
+        *to = PyUnstable_Long_CompactValue((PyLongObject *)v);
         return 0;
       }
 #endif
       long long n = PyLong_AsLongLongAndOverflow(v, &overflow);
       if (overflow || (kind == OPTIONAL && n == INT64_MIN)) return 1;
-      *(int64_t *)to = n;
+      *to = n;
       return 0;
     }
   }
 }
-static inline size_t width(int kind) { return kind == BOOL ? 1 : 8; }
-static inline int differs(int kind, const char *a, const char *b) {
-  return kind == BOOL ? *a != *b : *(const int64_t *)a != *(const int64_t *)b;
-}
-static inline void copy(int kind, char *to, const char *from) {
-  if (kind == BOOL) *to = *from;
-  else *(int64_t *)to = *(const int64_t *)from;
-}
-INLINE int take(int kind, PyObject *v, const struct Values *s, size_t offset, int object) {
-  if (v == s->objects[object]) return v == NULL;
-  if (load_value(kind, v, s->now + offset)) return 1;
-  copy(kind, s->old + offset, s->now + offset);
-  Py_XSETREF(s->objects[object], Py_NewRef(v));
+INLINE int take(int kind, PyObject *v, int64_t *now, int64_t *old, PyObject **object) {
+  if (v == *object || kind == NOTHING) return 0;
+  if (load_value(kind, v, now)) return 1;
+  *old = *now;
+  Py_SETREF(*object, Py_NewRef(v));
   return 0;
 }
-/* Read the variables of `o`. `use` lists the entries that are read; NULL: all `n`. Return 1 if Python must take over. */
-FAST static int load(const struct Bound *b, int of, const int *use, int n, PyObject *o, const struct Values *s) {
+static int load(const struct Bound *b, int of, const struct Use *use, PyObject *o, const struct Values *s);
+static int load_part(const struct Bound *b, const struct Part *p, PyObject *v, const struct Values *s) {
+  if (p->kind == BLOCK) return load(b, p->block, NULL, v, &WITHIN(s, p));
+  if (v == NULL || !PyList_CheckExact(v) || PyList_GET_SIZE(v) != p->size) return 1;
+  int64_t *now = (int64_t *)(s->now + p->offset), *old = (int64_t *)(s->old + p->offset);
+  for (uint32_t at = 0; at < p->size; at++) {
+    PyObject *element = PyList_GET_ITEM(v, at);
+    if (p->kind == BLOCKS ? load(b, p->block, NULL, element, &ELEMENT(s, p, at))
+                          : take(p->of, element, now + at, old + at, s->objects + p->object + at)) return 1;
+  }
+  return 0;
+}
+/* Read the variables of `o`, all of them if `use` is NULL. Return 1 if Python must take over. */
+FAST static int load(const struct Bound *b, int of, const struct Use *use, PyObject *o, const struct Values *s) {
   const struct Class *c = &CLASSES[of];
   if (o == NULL || Py_TYPE(o) != b->types[of]) return 1;
-  *(PyObject **)s->now = o;  /* each structure begins with its object */
-  for (int k = 0; k < n; k++) {
-    int i = use ? use[k] : k;
-    const struct Entry *e = &c->entries[i];
-    PyObject *v = *(PyObject **)((char *)o + c->slots[i]);
-    switch (e->kind) {
-      case BLOCK:
-        if (load(b, e->block, NULL, CLASSES[e->block].values, v, &WITHIN(s, e))) return 1;
-        break;
-      case BLOCKS:
-        if (v == NULL || !PyList_CheckExact(v) || PyList_GET_SIZE(v) != e->size) return 1;
-        for (uint32_t at = 0; at < e->size; at++)
-          if (load(b, e->block, NULL, CLASSES[e->block].values, PyList_GET_ITEM(v, at), &ELEMENT(s, e, at))) return 1;
-        break;
-      case ARRAY:
-        if (v == NULL || !PyList_CheckExact(v) || PyList_GET_SIZE(v) != e->size) return 1;
-        for (int at = 0; at < e->size; at++)
-          if (take(e->of, PyList_GET_ITEM(v, at), s, e->offset + at * width(e->of), e->object + at)) return 1;
-        break;
-      default:
-        if (take(e->kind, v, s, e->offset, e->object)) return 1;
-    }
+  *(PyObject **)s->now = o;
+  const int *numbers = use ? use->numbers : NULL;
+  PyObject **slots = &SLOT(o, c, 0), **objects = s->objects;
+  for (int n = 0, count = use ? use->row : c->row; n < count; n++) {
+    int k = numbers ? numbers[n] : n;
+    if (slots[k] != objects[k] && take(c->kinds[k], slots[k], ROW(s->now) + k, ROW(s->old) + k, objects + k)) return 1;
+  }
+  if (use) numbers += use->row;
+  for (int n = 0, count = use ? use->read : c->read; n < count; n++) {
+    int k = numbers ? numbers[n] : n;
+    if (load_part(b, &c->part[k], SLOT(o, c, c->row + k), s)) return 1;
   }
   return 0;
 }
-/* Forget what was read and computed, because machine code ended in the middle. */
+/* Forget what was read and computed, because machine code ended in the middle, or has not run before. */
 static void forget(const struct Values *s, size_t size, int objects) {
   memset(s->now, 0, size);
-  for (int n = 0; n < objects; n++) Py_CLEAR(s->objects[n]);
+  memset(s->old, 0, size);
+  for (int n = 0; n < objects; n++) Py_XSETREF(s->objects[n], Py_NewRef(Py_Ellipsis));
 }
 
-static PyObject *made(int kind, const char *from) {
+static PyObject *made(int kind, const int64_t *from) {
   switch (kind) {
-    case BOOL: return PyBool_FromLong(*from);
+    case BOOL: return PyBool_FromLong(*from != 0);
     case FLOAT: return PyFloat_FromDouble(*(const double *)from);
     case OPTIONAL:
-      if (*(const int64_t *)from == INT64_MIN) Py_RETURN_NONE;
+      if (*from == INT64_MIN) Py_RETURN_NONE;
     /* fall through */
-    default: return PyLong_FromLongLong(*(const int64_t *)from);
+    default: return PyLong_FromLongLong(*from);
   }
 }
+#define CONSTANT(code) CONSTANTS[-(code) - 1]
 static PyObject *record(const struct Record *r, int64_t scan) {
   PyObject *found = PyTuple_New(3 + r->count), *number = PyLong_FromLongLong(scan);
   if (!found || !number) { Py_XDECREF(found); Py_XDECREF(number); return NULL; }
@@ -224,112 +235,125 @@ static inline int put(PyObject **slot, PyObject *v) {
   Py_XDECREF(before);
   return 0;
 }
-
-/* Where changed variables are published: a dictionary, and for each entry its key, or None. */
-struct Publication { PyObject *to, *keys; };
-
-/* Return whether the variable has changed; -1, with an exception, without memory. */
-INLINE int change(int kind, PyObject **slot, const struct Values *s, size_t offset, int object) {
-  if (!differs(kind, s->now + offset, s->old + offset)) return 0;
-  PyObject *v = made(kind, s->now + offset);
+/* Write a variable that has changed. Return -1, with an exception, without memory. */
+INLINE int change(int kind, PyObject **slot, const int64_t *now, int64_t *old, PyObject **object) {
+  PyObject *v = made(kind, now);
   if (v == NULL) return -1;
-  copy(kind, s->old + offset, s->now + offset);
-  Py_XSETREF(s->objects[object], Py_NewRef(v));
-  return put(slot, v) ? -1 : 1;
+  *old = *now;
+  Py_SETREF(*object, Py_NewRef(v));
+  return put(slot, v);
 }
 
-/* Write the variables that have changed. Return -1, with an exception, without memory. */
-FAST static int store(int of, const int *use, int n, PyObject *o, const struct Values *s, int64_t scan,
-                      const struct Publication *p) {
-  const struct Class *c = &CLASSES[of];
-  for (int k = 0; k < n; k++) {
-    int i = use ? use[k] : k;
-    const struct Entry *e = &c->entries[i];
-    PyObject **slot = (PyObject **)((char *)o + c->slots[i]);
-    switch (e->kind) {
-      case BLOCK:
-        if (store(e->block, NULL, CLASSES[e->block].count, *slot, &WITHIN(s, e), scan, NULL)) return -1;
-        break;
-      case BLOCKS:
-        for (uint32_t at = 0; at < e->size; at++)
-          if (store(e->block, NULL, CLASSES[e->block].count, PyList_GET_ITEM(*slot, at), &ELEMENT(s, e, at), scan, NULL)) return -1;
-        break;
-      case ARRAY:
-        for (int at = 0; at < e->size; at++)
-          if (change(e->of, &((PyListObject *)*slot)->ob_item[at], s, e->offset + at * width(e->of), e->object + at) < 0) return -1;
-        break;
-      case LINE:
-      case RECORD: {
-        struct Record *r = (struct Record *)(s->now + e->offset);
-        if (!r->code) break;
-        PyObject *constant = CONSTANTS[r->code - 1];
-        if (r->count >= 0 ? put(slot, record(r, scan)) : *slot != constant && put(slot, Py_NewRef(constant))) return -1;
-        r->code = 0;
-        break;
-      }
-      case LINES: {
-        struct Lines *lines = (struct Lines *)(s->now + e->offset);
-        for (int at = 0; at < lines->count; at++) {
-          struct Record *r = RECORDS(lines, e->size) + at;
-          PyObject *key = PyLong_FromLongLong(r->key), *made_one = record(r, scan);
-          int failed = !key || !made_one || PyObject_SetItem(*slot, key, made_one);
-          Py_XDECREF(key);
-          Py_XDECREF(made_one);
-          if (failed) return -1;
-          lines->at[r->key] = 0;
-        }
-        lines->count = 0;
-        break;
-      }
-      default:
-        switch (change(e->kind, slot, s, e->offset, e->object)) {
-          case 0: break;
-          case 1:
-            if (p && PyTuple_GET_ITEM(p->keys, i) != Py_None
-                && PyDict_SetItem(p->to, PyTuple_GET_ITEM(p->keys, i), *slot)) return -1;
-            break;
-          default: return -1;
-        }
+/* Where changed variables are published: a dictionary, and for each variable of the row its key, or None. */
+struct Publication { PyObject *to, *keys; };
+
+static int store(int of, const struct Use *use, PyObject *o, const struct Values *s, int64_t scan, const struct Publication *p);
+static int store_part(const struct Part *p, PyObject **slot, const struct Values *s, int64_t scan) {
+  switch (p->kind) {
+    case BLOCK:
+      return store(p->block, NULL, *slot, &WITHIN(s, p), scan, NULL);
+    case BLOCKS:
+      for (uint32_t at = 0; at < p->size; at++)
+        if (store(p->block, NULL, PyList_GET_ITEM(*slot, at), &ELEMENT(s, p, at), scan, NULL)) return -1;
+      return 0;
+    case ARRAY: {
+      int64_t *now = (int64_t *)(s->now + p->offset), *old = (int64_t *)(s->old + p->offset);
+      for (uint32_t at = 0; at < p->size; at++)
+        if (now[at] != old[at]
+            && change(p->of, &((PyListObject *)*slot)->ob_item[at], now + at, old + at, s->objects + p->object + at)) return -1;
+      return 0;
     }
+    case RECORD: {
+      struct Record *r = (struct Record *)(s->now + p->offset);
+      if (!r->code) return 0;
+      if (r->code > 0 ? put(slot, record(r, scan)) : put(slot, Py_NewRef(CONSTANT(r->code)))) return -1;
+      r->code = 0;
+      return 0;
+    }
+    default: {
+      struct Lines *lines = (struct Lines *)(s->now + p->offset);
+      for (int at = 0; at < lines->count; at++) {
+        struct Record *r = RECORDS(lines, p->size) + at;
+        PyObject *key = PyLong_FromLongLong(r->key), *made_one = record(r, scan);
+        int failed = !key || !made_one || PyObject_SetItem(*slot, key, made_one);
+        Py_XDECREF(key);
+        Py_XDECREF(made_one);
+        if (failed) return -1;
+        lines->at[r->key] = 0;
+      }
+      lines->count = 0;
+      return 0;
+    }
+  }
+}
+/* Write the variables that have changed. Return -1, with an exception, without memory. */
+FAST static int store(int of, const struct Use *use, PyObject *o, const struct Values *s, int64_t scan, const struct Publication *p) {
+  const struct Class *c = &CLASSES[of];
+  const int *numbers = use ? use->numbers : NULL;
+  int64_t *now = ROW(s->now), *old = ROW(s->old);
+  for (int n = 0, count = use ? use->row : c->row; n < count; n++) {
+    int k = numbers ? numbers[n] : n;
+    if (now[k] == old[k]) continue;
+    PyObject **slot = &SLOT(o, c, 0) + k;
+    if (change(c->kinds[k], slot, now + k, old + k, s->objects + k)) return -1;
+    if (p && PyTuple_GET_ITEM(p->keys, k) != Py_None && PyDict_SetItem(p->to, PyTuple_GET_ITEM(p->keys, k), *slot)) return -1;
+  }
+  if (use) numbers += use->row;
+  for (int n = 0, count = use ? use->parts : c->parts; n < count; n++) {
+    int k = numbers ? numbers[n] : n;
+    if (store_part(&c->part[k], &SLOT(o, c, c->row + k), s, scan)) return -1;
+  }
+  if (use) numbers += use->parts;
+  struct Line *lines = (struct Line *)(s->now + c->first_line);
+  for (int n = 0, count = use ? use->lines : c->lines; n < count; n++) {
+    int k = numbers ? numbers[n] : n;
+    if (!lines[k].code) continue;
+    PyObject *constant = CONSTANT(lines[k].code), **slot = &SLOT(o, c, c->row + c->parts + k);
+    if (*slot != constant && put(slot, Py_NewRef(constant))) return -1;
+    lines[k].code = 0;
   }
   return 0;
 }
 
 /* Read and write the global variables, whose object has a dictionary. */
-static int load_globals(const struct Bound *b, const int *use, int n, PyObject *o, const struct Values *s) {
-  for (int k = 0; k < n; k++) {
-    const struct Entry *e = &CLASSES[1].entries[use[k]];
-    if (e->kind == LINE || e->kind == RECORD) continue;
-    PyObject *v = PyObject_GetAttrString(o, CLASSES[1].names[use[k]]);
-    int failed;
+static int load_globals(const struct Bound *b, const struct Use *use, PyObject *o, const struct Values *s) {
+  const struct Class *c = &CLASSES[1];
+  for (int n = 0; n < use->row + use->read; n++) {
+    int k = use->numbers[n], is_part = n >= use->row;
+    PyObject *v = PyObject_GetAttrString(o, c->names[is_part ? c->row + k : k]);
     if (v == NULL) { PyErr_Clear(); return 1; }
-    if (e->kind == BLOCK) failed = load(b, e->block, NULL, CLASSES[e->block].values, v, &WITHIN(s, e));
-    else failed = take(e->kind, v, s, e->offset, e->object);
+    int failed = is_part ? load_part(b, &c->part[k], v, s)
+                         : take(c->kinds[k], v, ROW(s->now) + k, ROW(s->old) + k, s->objects + k);
     Py_DECREF(v);
     if (failed) return 1;
   }
   return 0;
 }
-static int store_globals(const int *use, int n, PyObject *o, const struct Values *s, int64_t scan) {
-  for (int k = 0; k < n; k++) {
-    const struct Entry *e = &CLASSES[1].entries[use[k]];
+static int store_globals(const struct Use *use, PyObject *o, const struct Values *s, int64_t scan) {
+  const struct Class *c = &CLASSES[1];
+  int64_t *now = ROW(s->now), *old = ROW(s->old);
+  for (int n = 0; n < use->row + use->parts + use->lines; n++) {
+    int k = use->numbers[n], at = k, is_changed = 0, failed = 0;
     PyObject *v = NULL;
-    int failed = 0;
-    if (e->kind == BLOCK) {
-      if ((v = PyObject_GetAttrString(o, CLASSES[1].names[use[k]])) == NULL) return -1;
-      failed = store(e->block, NULL, CLASSES[e->block].count, v, &WITHIN(s, e), scan, NULL);
-      Py_DECREF(v);
-    } else if (e->kind == LINE || e->kind == RECORD) {
-      struct Record *r = (struct Record *)(s->now + e->offset);
-      if (!r->code) continue;
-      v = r->count < 0 ? Py_NewRef(CONSTANTS[r->code - 1]) : record(r, scan);
-      r->code = 0;
-      failed = v == NULL || PyObject_SetAttrString(o, CLASSES[1].names[use[k]], v);
-      Py_XDECREF(v);
-    } else if (differs(e->kind, s->now + e->offset, s->old + e->offset)) {
-      failed = change(e->kind, &v, s, e->offset, e->object) < 0 || PyObject_SetAttrString(o, CLASSES[1].names[use[k]], v);
-      Py_XDECREF(v);
+    if (n < use->row) {
+      is_changed = now[k] != old[k];
+      failed = is_changed && change(c->kinds[k], &v, now + k, old + k, s->objects + k);
+    } else if (n < use->row + use->read) {
+      if ((v = PyObject_GetAttrString(o, c->names[c->row + k])) == NULL) return -1;
+      failed = store_part(&c->part[k], &v, s, scan);
+    } else if (n < use->row + use->parts) {
+      at = c->row + k;
+      is_changed = ((struct Record *)(s->now + c->part[k].offset))->code != 0;
+      failed = store_part(&c->part[k], &v, s, scan);
+    } else {
+      at = c->row + c->parts + k;
+      struct Line *line = (struct Line *)(s->now + c->first_line) + k;
+      is_changed = line->code != 0;
+      if (is_changed) v = Py_NewRef(CONSTANT(line->code));
+      line->code = 0;
     }
+    failed = failed || (is_changed && PyObject_SetAttrString(o, c->names[at], v));
+    Py_XDECREF(v);
     if (failed) return -1;
   }
   return 0;

@@ -249,7 +249,7 @@ class _Body:
     def _record(self, line: str, field: Field, value: ast.expr) -> str:
         """Translate a record: a constant, or the number of the scan, a constant, the object, and values of indices."""
         if isinstance(value, ast.Constant) or (isinstance(value, ast.Tuple) and _is_constant(value)):
-            return f"{line}->code = {self._unit.constant(value)}; {line}->count = -1;\n"
+            return f"{line}->code = -{self._unit.constant(value)};\n"
         maker = ast.unparse(value.elts[2]) if isinstance(value, ast.Tuple) else ""
         if not isinstance(value, ast.Tuple) or ast.unparse(value.elts[0]) != "_c.scan" or maker not in ("self", "None"):
             raise Unsupported("a record of an assignment")

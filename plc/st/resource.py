@@ -15,13 +15,13 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.image.image import Message
 from fieldtwin.gateway.core.values import TagValue
 from fieldtwin.plc.blocks import BLOCKS, FunctionBlock
-from fieldtwin.plc.program import Outbox, ScanInfo
+from fieldtwin.plc.program import Outbox, ScanInfo, ScanTooLong
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.initial.values import FB_INIT
 from fieldtwin.plc.st.compiler.pous.inlining import NAMES
+from fieldtwin.plc.st.context import MAX_STEPS, Context
 from fieldtwin.plc.st.native.programs import RUNS
-from fieldtwin.plc.st.runtime.context import MAX_STEPS, Context
 from fieldtwin.plc.st.runtime.layouts import Stored, Union
 from fieldtwin.plc.st.runtime.logic_error import LogicError
 from fieldtwin.plc.st.runtime.references import REFERENCES, Instance

@@ -67,7 +67,7 @@ class Layout:
     constants: Mapping[str, object] = field(default_factory=dict)
 
     def row(self) -> list[Field | None]:
-        """Return the variables without parts in the order of their memory; None for a slot between them that is none of them."""
+        """Return the variables without parts in the order of their memory; None for another slot between them."""
         if not self.slots:
             return [one for one in self.fields.values() if one.kind in ROW]
         found = [self.fields.get(name) for name in self.slots]
@@ -78,7 +78,9 @@ class Layout:
     def parts(self) -> list[Field]:
         """Return the blocks and arrays, and after them the records that have values."""
         found = [one for one in self.fields.values() if one.kind in ("block", "blocks", "array")]
-        return found + [one for one in self.fields.values() if one.kind == "lines" or (one.kind == "line" and one.values)]
+        return found + [
+            one for one in self.fields.values() if one.kind == "lines" or (one.kind == "line" and one.values)
+        ]
 
     def lines(self) -> list[Field]:
         """Return the records without values."""

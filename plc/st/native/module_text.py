@@ -6,13 +6,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 
+from fieldtwin.plc.st.context import Context
 from fieldtwin.plc.st.native.layouts import Field, Layout
 from fieldtwin.plc.st.native.statements import Translation
-from fieldtwin.plc.st.runtime.context import Context
 
 MODULE = "fieldtwin_machine_code"
 _KINDS = {"bool": "BOOL", "int": "INT", "float": "FLOAT", "optional": "OPTIONAL"}
-_CONTEXT = Layout("Context", {name: Field(name, "int") for name in ("now_ns", "left", "scan")}, tuple(sorted(Context.__slots__)))
+_CONTEXT = Layout(
+    "Context", {name: Field(name, "int") for name in ("now_ns", "left", "scan")}, tuple(sorted(Context.__slots__))
+)
 _CONTEXT.fields["first_scan"] = Field("first_scan", "bool")
 _FIRST = 2
 """The number of the first class after the context and the global variables."""
@@ -132,7 +134,8 @@ static PyObject *run_{name}(PyObject *capsule, PyObject *const *given, Py_ssize_
     forget(&g, sizeof g_now, {shared});
     forget(&c, sizeof c_now, {in_context});
   }}
-  if (load(b, 0, NULL, given[1], &c) || load(b, {number}, &U_{name}, given[0], &s) || load_globals(b, &UG_{name}, given[2], &g)) Py_RETURN_NONE;
+  if (load(b, 0, NULL, given[1], &c) || load(b, {number}, &U_{name}, given[0], &s)
+      || load_globals(b, &UG_{name}, given[2], &g)) Py_RETURN_NONE;
   int result = {name}(&now, &c_now, &g_now);
   if (result != 1) {{
     int64_t scan = c_now.f_scan;
@@ -181,19 +184,7 @@ static PyObject *bind(PyObject *module, PyObject *given) {{
     PyObject *type = PyTuple_GET_ITEM(types, n);
     if (type == Py_None) continue;
     b->types[n] = (PyTypeObject *)Py_NewRef(type);
-    for (int k = 0; k < TABLE[n].row + TABLE[n].parts + TABLE[n].lines; k++) {{
-      Py_ssize_t *slot = &TABLE[n].slots[k];
-      if (!*TABLE[n].names[k]) {{ *slot = slot[-1] + (Py_ssize_t)sizeof(PyObject *); continue; }}
-      PyObject *found = PyObject_GetAttrString(type, TABLE[n].names[k]);
-      if (found == NULL) return NULL;
-      PyMemberDef *member = Py_IS_TYPE(found, &PyMemberDescr_Type) ? ((PyMemberDescrObject *)found)->d_member : NULL;
-      if (member) *slot = member->offset;
-      Py_DECREF(found);
-      if (!member || member->type != T_OBJECT_EX || (0 < k && k < TABLE[n].row && *slot != slot[-1] + (Py_ssize_t)sizeof(PyObject *))) {{
-        PyErr_Format(PyExc_TypeError, "%s is not the expected slot", TABLE[n].names[k]);
-        return NULL;
-      }}
-    }}
+    if (find_slots(type, &TABLE[n])) return NULL;
   }}
   if (CONSTANTS == NULL) {{
     CONSTANTS = ((PyTupleObject *)Py_NewRef(constants))->ob_item;

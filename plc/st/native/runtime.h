@@ -22,8 +22,8 @@ struct Record { int32_t code, count; PyObject *maker; int64_t key; int64_t value
    the number of its first Python object; its place in the structure. */
 struct Part { uint8_t kind, of; uint16_t block; uint32_t size, object, offset; };
 /* A class. Its structure begins with the Python object. Then comes the row of the variables without parts: numbers of 8 bytes in the order of
-   the slots of the Python object, which follow each other too, so that a scan compares them in short loops. A slot between them that is
-   not one of them has the kind NOTHING. After the row come `parts`, of which the first `read` are read, and `lines` records without
+   the slots of the Python object, which are consecutive too, so that a scan compares them in short loops. Another slot between them has
+   the kind NOTHING. After the row come `parts`, of which the first `read` are read, and `lines` records without
    values, from `first_line`. `names` and `slots` are those of the row, the parts and the lines. `objects` is the number of Python
    objects of all values, those of the row first. */
 struct Class {
@@ -125,6 +125,24 @@ static inline struct Record *record_at(struct Lines *lines, int size, int64_t ke
   struct Record *r = RECORDS(lines, size) + lines->at[key] - 1;
   r->key = key;
   return r;
+}
+
+/* Fill the table of the slots of a class. Return -1, with an exception, if they are not as expected. */
+static int find_slots(PyObject *type, const struct Class *c) {
+  for (int k = 0; k < c->row + c->parts + c->lines; k++) {
+    const Py_ssize_t next = k ? c->slots[k - 1] + (Py_ssize_t)sizeof(PyObject *) : 0;
+    if (!*c->names[k]) { c->slots[k] = next; continue; }
+    PyObject *found = PyObject_GetAttrString(type, c->names[k]);
+    if (found == NULL) return -1;
+    PyMemberDef *member = Py_IS_TYPE(found, &PyMemberDescr_Type) ? ((PyMemberDescrObject *)found)->d_member : NULL;
+    if (member) c->slots[k] = member->offset;
+    Py_DECREF(found);
+    if (member == NULL || member->type != T_OBJECT_EX || (0 < k && k < c->row && c->slots[k] != next)) {
+      PyErr_Format(PyExc_TypeError, "%s is not the expected slot", c->names[k]);
+      return -1;
+    }
+  }
+  return 0;
 }
 
 static inline int load_value(int kind, PyObject *v, int64_t *to) {

@@ -21,7 +21,7 @@ from fieldtwin.plc.program import ProgramFailed, ProgramStuck, ScanTooLong
 from fieldtwin.plc.prove import Proof, prove
 from fieldtwin.plc.runtime.config import PlcConfig, ProgramConfig
 from fieldtwin.plc.runtime.runner import TaskRunner
-from fieldtwin.plc.st.runtime.context import MAX_STEPS
+from fieldtwin.plc.st.context import MAX_STEPS
 from fieldtwin.testing.worker.stepped_program import SteppedProgram
 
 ENDLESS = {

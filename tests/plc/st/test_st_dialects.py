@@ -16,6 +16,7 @@ from fieldtwin.plc.binding import load_program
 from fieldtwin.plc.st.compiler.compile import CompiledUnit, compile_text
 from fieldtwin.plc.st.dialects import DIALECTS, FINDINGS, MAX_WARNINGS, WARNINGS, chosen_ids, dialect_of
 from fieldtwin.plc.st.program import program_class
+from fieldtwin.plc.st.resource import attributes_of
 from fieldtwin.plc.st.values import LogicError
 from fieldtwin.twin.site.schema import ProgramForm
 
@@ -33,7 +34,7 @@ def compiled(body: str, dialect: str) -> CompiledUnit:
 def after(body: str, dialect: str = "codesys") -> dict[str, Any]:
     made = program_class(compiled(body, dialect))()
     scan(made)
-    return {name[2:]: value for name, value in vars(made.st_body).items() if name.startswith("v_")}
+    return {name[2:]: value for name, value in attributes_of(made.st_body).items() if name.startswith("v_")}
 
 
 ACCEPTED = [
@@ -298,7 +299,7 @@ def last_of(body: str, dialect: str, scans: int = 1) -> dict[str, Any]:
     made = program_class(compile_text(f"{LAMP}{body}\nEND_PROGRAM", "p.st", DIALECTS[dialect]))()
     for _ in range(scans):
         scan(made)
-    return {name[2:]: value for name, value in vars(made.st_body).items() if name.startswith("v_")}
+    return {name[2:]: value for name, value in attributes_of(made.st_body).items() if name.startswith("v_")}
 
 
 EMPTY_OR_LATCHED = [
@@ -331,7 +332,7 @@ def test_a_semicolon_may_follow_the_result_of_a_function() -> None:
     text = f"{twice}PROGRAM p VAR r : INT; END_VAR\nr := Twice(4); END_PROGRAM"
     made = program_class(compile_text(text, "p.st", DIALECTS["twincat"]))()
     scan(made)
-    assert vars(made.st_body)["v_r"] == 8
+    assert attributes_of(made.st_body)["v_r"] == 8
 
 
 BISTABLES = """PROGRAM p VAR a, b : BOOL; s : SR; r : RS; up : CTU; down : CTD_DINT; both : CTUD; n : INT; l : DINT; END_VAR

@@ -19,6 +19,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.values import Quality, TagValue
 from fieldtwin.plc.st.compiler.compile import compile_text
 from fieldtwin.plc.st.program import program_class
+from fieldtwin.plc.st.resource import attributes_of
 from fieldtwin.plc.st.values import LogicError
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -182,7 +183,7 @@ def test_expressions_of_any_types(assigned: list[tuple[str, str]]) -> None:
             scan(made, number)
     except LogicError:
         pass
-    held = vars(made.st_body)
+    held = attributes_of(made.st_body)
     for name, (low, high) in LIMITS.items():
         value = held[f"v_{name}"]
         assert type(value) is int, (name, value)

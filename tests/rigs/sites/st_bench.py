@@ -8,6 +8,7 @@ from fieldtwin.plc.program import ScanInfo
 from fieldtwin.plc.st.compiler.compile import compile_text
 from fieldtwin.plc.st.dialects import DIALECTS
 from fieldtwin.plc.st.program import StProgram, program_class
+from fieldtwin.plc.st.resource import attributes_of
 
 
 def program(text: str, name: str = "", dialect: str = "standard") -> StProgram:
@@ -23,7 +24,7 @@ def run(variables: str, body: str, before: str = "", scans: int = 1, dialect: st
     made = program(f"{before}\nPROGRAM p VAR {variables} END_VAR\n{body}\nEND_PROGRAM", "p", dialect)
     for number in range(1, scans + 1):
         scan(made, number)
-    return {name[2:]: value for name, value in vars(made.st_body).items() if name.startswith("v_")}
+    return {name[2:]: value for name, value in attributes_of(made.st_body).items() if name.startswith("v_")}
 
 
 def value(kind: str, expression: str, variables: str = "", before: str = "") -> Any:

@@ -12,7 +12,7 @@ from fieldtwin.plc.st import values
 
 MAX_STEPS = 1_000_000
 """How many loop iterations, and calls of functions and function blocks, a program may make in one scan. The limit is
-the same in real and in virtual time, where there is no other way to end an endless loop."""
+the same in real and in virtual time; in virtual time nothing else ends an endless loop."""
 
 
 class Context:

@@ -20,8 +20,8 @@ from fieldtwin.plc.st.compiler.classes.members import method_of
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
 from fieldtwin.plc.st.compiler.functions.standard import FUNCTIONS
 from fieldtwin.plc.st.compiler.scope import CodeWriter, Symbol
+from fieldtwin.plc.st.context import MAX_STEPS
 from fieldtwin.plc.st.dialects import WarningCollector
-from fieldtwin.plc.st.resource import MAX_STEPS
 from fieldtwin.plc.st.syntax import tree as t
 from fieldtwin.plc.st.syntax.parse import parse_expression
 from fieldtwin.plc.st.syntax.walk import nodes

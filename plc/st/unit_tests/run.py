@@ -18,8 +18,9 @@ from fieldtwin.plc.program import ScanTooLong
 from fieldtwin.plc.st import types as ty
 from fieldtwin.plc.st import values
 from fieldtwin.plc.st.compiler.compile import CompiledUnit
+from fieldtwin.plc.st.context import MAX_STEPS, Context
 from fieldtwin.plc.st.inspection import elements, literal
-from fieldtwin.plc.st.resource import MAX_STEPS, Context, Resource, line_of_error
+from fieldtwin.plc.st.resource import Resource, line_of_error
 from fieldtwin.plc.st.unit_tests.assertions import AssertionText, TranslatedTest
 
 CYCLE_NS = 10 * NS_PER_MS

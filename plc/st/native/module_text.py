@@ -119,7 +119,7 @@ class ModuleText:
         in_context = len(_CONTEXT.row())
         return f"""
 {_use(f"U_{name}", layout, {attribute for owner, attribute in run.used if owner == "self"})}
-{_use(f"UG_{name}", self._globals, {attribute for owner, attribute in run.used if owner == "_G"})}
+{_use(f"UG_{name}", self._globals, {attribute for owner, attribute in run.used if owner == "_G"}, has_slots=False)}
 static PyObject *run_{name}(PyObject *capsule, PyObject *const *given, Py_ssize_t count) {{
   static struct S_{layout.name} now, old;
   static struct S_globals g_now, g_old;
@@ -203,18 +203,19 @@ PyMODINIT_FUNC PyInit_{MODULE}(void) {{ return PyModule_Create(&DEFINITION); }}
 """
 
 
-def _use(name: str, layout: Layout, used: set[str]) -> str:
-    """Return the C table of the variables of a structure that a run uses."""
+def _use(name: str, layout: Layout, used: set[str], *, has_slots: bool = True) -> str:
+    """Return the C table of the variables of a structure that a run uses; without numbers if it uses all values of slots."""
+    found = (layout.row(), layout.parts(), layout.lines())
+    values = [one for one in (*found[0], *found[1]) if one is not None and one.kind not in ("line", "lines")]
+    uses_all = has_slots and all(one.name in used for one in values)
     row, parts, lines = (
-        [n for n, one in enumerate(found) if one and one.name in used]
-        for found in (layout.row(), layout.parts(), layout.lines())
+        [n for n, one in enumerate(each) if uses_all or (one is not None and one.name in used)] for each in found
     )
-    read = _read(layout.parts()[n] for n in parts)
+    counts = f"{len(row)}, {_read(layout.parts()[n] for n in parts)}, {len(parts)}, {len(lines)}"
+    if uses_all:
+        return f"static const struct Use {name} = {{{counts}, NULL}};"
     numbers = ", ".join(map(str, [*row, *parts, *lines, 0]))
-    return (
-        f"static const int N_{name}[] = {{{numbers}}};\n"
-        f"static const struct Use {name} = {{{len(row)}, {read}, {len(parts)}, {len(lines)}, N_{name}}};"
-    )
+    return f"static const int N_{name}[] = {{{numbers}}};\nstatic const struct Use {name} = {{{counts}, N_{name}}};"
 
 
 def _read(parts: Iterable[Field]) -> int:

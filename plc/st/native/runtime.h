@@ -34,7 +34,8 @@ struct Class {
   const char *const *names;
   Py_ssize_t *slots;
 };
-/* The variables that a run uses: numbers in the row, then of parts, then of lines. */
+/* The variables that a run uses: how many of each kind, and their numbers in the row, then of parts, then of lines. Without numbers it
+   uses all variables of the class. */
 struct Use { int row, read, parts, lines; const int *numbers; };
 /* The Python classes of one resource. */
 struct Bound { PyTypeObject **types; };
@@ -185,14 +186,30 @@ INLINE int take(int kind, PyObject *v, int64_t *now, int64_t *old, PyObject **ob
   Py_SETREF(*object, Py_NewRef(v));
   return 0;
 }
+INLINE int load_row(const struct Class *c, const int *numbers, int count, PyObject *o, const struct Values *s) {
+  PyObject **slots = &SLOT(o, c, 0), **objects = s->objects;
+  int64_t *now = ROW(s->now), *old = ROW(s->old);
+  for (int n = 0; n < count; n++) {
+    int k = numbers ? numbers[n] : n;
+    if (slots[k] != objects[k] && take(c->kinds[k], slots[k], now + k, old + k, objects + k)) return 1;
+  }
+  return 0;
+}
 static int load(const struct Bound *b, int of, const struct Use *use, PyObject *o, const struct Values *s);
-static int load_part(const struct Bound *b, const struct Part *p, PyObject *v, const struct Values *s) {
-  if (p->kind == BLOCK) return load(b, p->block, NULL, v, &WITHIN(s, p));
+INLINE int load_block(const struct Bound *b, int of, PyObject *o, const struct Values *s) {
+  const struct Class *c = &CLASSES[of];
+  if (c->read) return load(b, of, NULL, o, s);
+  if (o == NULL || Py_TYPE(o) != b->types[of]) return 1;
+  *(PyObject **)s->now = o;
+  return load_row(c, NULL, c->row, o, s);
+}
+FAST static int load_part(const struct Bound *b, const struct Part *p, PyObject *v, const struct Values *s) {
+  if (p->kind == BLOCK) return load_block(b, p->block, v, &WITHIN(s, p));
   if (v == NULL || !PyList_CheckExact(v) || PyList_GET_SIZE(v) != p->size) return 1;
   int64_t *now = (int64_t *)(s->now + p->offset), *old = (int64_t *)(s->old + p->offset);
   for (uint32_t at = 0; at < p->size; at++) {
     PyObject *element = PyList_GET_ITEM(v, at);
-    if (p->kind == BLOCKS ? load(b, p->block, NULL, element, &ELEMENT(s, p, at))
+    if (p->kind == BLOCKS ? load_block(b, p->block, element, &ELEMENT(s, p, at))
                           : take(p->of, element, now + at, old + at, s->objects + p->object + at)) return 1;
   }
   return 0;
@@ -203,12 +220,8 @@ FAST static int load(const struct Bound *b, int of, const struct Use *use, PyObj
   if (o == NULL || Py_TYPE(o) != b->types[of]) return 1;
   *(PyObject **)s->now = o;
   const int *numbers = use ? use->numbers : NULL;
-  PyObject **slots = &SLOT(o, c, 0), **objects = s->objects;
-  for (int n = 0, count = use ? use->row : c->row; n < count; n++) {
-    int k = numbers ? numbers[n] : n;
-    if (slots[k] != objects[k] && take(c->kinds[k], slots[k], ROW(s->now) + k, ROW(s->old) + k, objects + k)) return 1;
-  }
-  if (use) numbers += use->row;
+  if (load_row(c, numbers, use ? use->row : c->row, o, s)) return 1;
+  if (numbers) numbers += use->row;
   for (int n = 0, count = use ? use->read : c->read; n < count; n++) {
     int k = numbers ? numbers[n] : n;
     if (load_part(b, &c->part[k], SLOT(o, c, c->row + k), s)) return 1;
@@ -265,14 +278,31 @@ INLINE int change(int kind, PyObject **slot, const int64_t *now, int64_t *old, P
 /* Where changed variables are published: a dictionary, and for each variable of the row its key, or None. */
 struct Publication { PyObject *to, *keys; };
 
+INLINE int store_row(const struct Class *c, const int *numbers, int count, PyObject *o, const struct Values *s,
+                     const struct Publication *p) {
+  int64_t *now = ROW(s->now), *old = ROW(s->old);
+  for (int n = 0; n < count; n++) {
+    int k = numbers ? numbers[n] : n;
+    if (now[k] == old[k]) continue;
+    PyObject **slot = &SLOT(o, c, 0) + k;
+    if (change(c->kinds[k], slot, now + k, old + k, s->objects + k)) return -1;
+    if (p && PyTuple_GET_ITEM(p->keys, k) != Py_None && PyDict_SetItem(p->to, PyTuple_GET_ITEM(p->keys, k), *slot)) return -1;
+  }
+  return 0;
+}
 static int store(int of, const struct Use *use, PyObject *o, const struct Values *s, int64_t scan, const struct Publication *p);
-static int store_part(const struct Part *p, PyObject **slot, const struct Values *s, int64_t scan) {
+INLINE int store_block(int of, PyObject *o, const struct Values *s, int64_t scan) {
+  const struct Class *c = &CLASSES[of];
+  if (c->parts || c->lines) return store(of, NULL, o, s, scan, NULL);
+  return store_row(c, NULL, c->row, o, s, NULL);
+}
+FAST static int store_part(const struct Part *p, PyObject **slot, const struct Values *s, int64_t scan) {
   switch (p->kind) {
     case BLOCK:
-      return store(p->block, NULL, *slot, &WITHIN(s, p), scan, NULL);
+      return store_block(p->block, *slot, &WITHIN(s, p), scan);
     case BLOCKS:
       for (uint32_t at = 0; at < p->size; at++)
-        if (store(p->block, NULL, PyList_GET_ITEM(*slot, at), &ELEMENT(s, p, at), scan, NULL)) return -1;
+        if (store_block(p->block, PyList_GET_ITEM(*slot, at), &ELEMENT(s, p, at), scan)) return -1;
       return 0;
     case ARRAY: {
       int64_t *now = (int64_t *)(s->now + p->offset), *old = (int64_t *)(s->old + p->offset);
@@ -308,20 +338,13 @@ static int store_part(const struct Part *p, PyObject **slot, const struct Values
 FAST static int store(int of, const struct Use *use, PyObject *o, const struct Values *s, int64_t scan, const struct Publication *p) {
   const struct Class *c = &CLASSES[of];
   const int *numbers = use ? use->numbers : NULL;
-  int64_t *now = ROW(s->now), *old = ROW(s->old);
-  for (int n = 0, count = use ? use->row : c->row; n < count; n++) {
-    int k = numbers ? numbers[n] : n;
-    if (now[k] == old[k]) continue;
-    PyObject **slot = &SLOT(o, c, 0) + k;
-    if (change(c->kinds[k], slot, now + k, old + k, s->objects + k)) return -1;
-    if (p && PyTuple_GET_ITEM(p->keys, k) != Py_None && PyDict_SetItem(p->to, PyTuple_GET_ITEM(p->keys, k), *slot)) return -1;
-  }
-  if (use) numbers += use->row;
+  if (store_row(c, numbers, use ? use->row : c->row, o, s, p)) return -1;
+  if (numbers) numbers += use->row;
   for (int n = 0, count = use ? use->parts : c->parts; n < count; n++) {
     int k = numbers ? numbers[n] : n;
     if (store_part(&c->part[k], &SLOT(o, c, c->row + k), s, scan)) return -1;
   }
-  if (use) numbers += use->parts;
+  if (numbers) numbers += use->parts;
   struct Line *lines = (struct Line *)(s->now + c->first_line);
   for (int n = 0, count = use ? use->lines : c->lines; n < count; n++) {
     int k = numbers ? numbers[n] : n;
@@ -337,7 +360,7 @@ FAST static int store(int of, const struct Use *use, PyObject *o, const struct V
 static int load_globals(const struct Bound *b, const struct Use *use, PyObject *o, const struct Values *s) {
   const struct Class *c = &CLASSES[1];
   for (int n = 0; n < use->row + use->read; n++) {
-    int k = use->numbers[n], is_part = n >= use->row;
+    int is_part = n >= use->row, k = use->numbers[n];
     PyObject *v = PyObject_GetAttrString(o, c->names[is_part ? c->row + k : k]);
     if (v == NULL) { PyErr_Clear(); return 1; }
     int failed = is_part ? load_part(b, &c->part[k], v, s)

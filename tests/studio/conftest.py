@@ -14,7 +14,7 @@ RUNNING = ExitStack()
 STARTED: list[Studio] = []
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def observatory() -> Studio:
     """A running Studio that has started the observatory's prototype. Its tests share it."""
     if not STARTED:

@@ -291,9 +291,11 @@ class Drive(DeviceModel):
         period_s = max(1, objects.whole(od.INTERPOLATION, 1, 1)) * 10.0 ** objects.whole(od.INTERPOLATION, 2, -3)
         x, v = self._motion.at((now_ns - self._began_ns) / NS_PER_S)
         distance = self._distance(self._wanted, x)
-        speed = abs(distance) / period_s
-        self._limited = inside != place or speed > most
         up, down = (_rate(objects, index, _UNLIMITED) for index in (od.MAX_ACCELERATION, od.MAX_DECELERATION))
+        # A motor that cannot stop at the target first brakes, and then has a longer way back.
+        back = abs(distance - v * abs(v) / (2 * down))
+        speed = max(abs(distance), back) / period_s
+        self._limited = inside != place or abs(distance) / period_s > most
         self._move(Motion(x, v, to_place(distance, v, max(min(speed, most), 1e-9), up, down)), now_ns)
 
     def _follow_torque(self, most: float, now_ns: int, objects: Objects) -> None:

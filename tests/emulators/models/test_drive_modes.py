@@ -197,6 +197,7 @@ def test_interrupted_homing_stops_and_is_not_attained(word: int) -> None:
 
 
 @given(st.lists(st.integers(-3_000, 3_000), min_size=1, max_size=20))
+@example([79, -5, -108, 42])  # the motor is at the last target when it comes, too fast to stop there
 @settings(max_examples=40)
 def test_cyclic_position_reaches_each_end_and_keeps_the_limits(steps: list[int]) -> None:
     rig = enabled(8)

@@ -117,6 +117,8 @@ class ModuleText:
         number, objects = self._numbers[layout.name], max(self._objects[layout.name], 1)
         shared = max(self._objects["globals"], 1)
         in_context = len(_CONTEXT.row())
+        forgotten = (("s", "now", objects), ("g", "g_now", shared), ("c", "c_now", in_context))
+        forget = " ".join(f"forget(&{of}, sizeof {now}, {count});" for of, now, count in forgotten)
         return f"""
 {_use(f"U_{name}", layout, {attribute for owner, attribute in run.used if owner == "self"})}
 {_use(f"UG_{name}", self._globals, {attribute for owner, attribute in run.used if owner == "_G"}, has_slots=False)}
@@ -129,11 +131,7 @@ static PyObject *run_{name}(PyObject *capsule, PyObject *const *given, Py_ssize_
   const struct Values c = {{(char *)&c_now, (char *)&c_old, c_objects}};
   const struct Bound *b = PyCapsule_GetPointer(capsule, "{MODULE}");
   if (b == NULL || count != 3) return NULL;
-  if (objects[0] == NULL) {{
-    forget(&s, sizeof now, {objects});
-    forget(&g, sizeof g_now, {shared});
-    forget(&c, sizeof c_now, {in_context});
-  }}
+  if (objects[0] == NULL) {{ {forget} }}
   if (load(b, 0, NULL, given[1], &c) || load(b, {number}, &U_{name}, given[0], &s)
       || load_globals(b, &UG_{name}, given[2], &g)) Py_RETURN_NONE;
   int result = {name}(&now, &c_now, &g_now);
@@ -151,9 +149,7 @@ static PyObject *run_{name}(PyObject *capsule, PyObject *const *given, Py_ssize_
     }}
     Py_XDECREF(published);
   }}
-  forget(&s, sizeof now, {objects});
-  forget(&g, sizeof g_now, {shared});
-  forget(&c, sizeof c_now, {in_context});
+  {forget}
   if (result != 1) return NULL;
   Py_RETURN_NONE;
 }}
@@ -211,7 +207,7 @@ def _use(name: str, layout: Layout, used: set[str], *, has_slots: bool = True) -
     row, parts, lines = (
         [n for n, one in enumerate(each) if uses_all or (one is not None and one.name in used)] for each in found
     )
-    counts = f"{len(row)}, {_read(layout.parts()[n] for n in parts)}, {len(parts)}, {len(lines)}"
+    counts = f"{len(row)}, {_read(found[1][n] for n in parts)}, {len(parts)}, {len(lines)}"
     if uses_all:
         return f"static const struct Use {name} = {{{counts}, NULL}};"
     numbers = ", ".join(map(str, [*row, *parts, *lines, 0]))

@@ -116,11 +116,11 @@ def with_configured(unit: t.SourceUnit, *, vendor: bool) -> t.SourceUnit:
         common = values.get(key, {})
         if _are_common(instances, own):
             common, own = {**common, **next(iter(own.values()), {})}, {}
-        pous[key] = [_with_values(program, common), *(
-            _with_values(copy_of(program, name), {**common, **changed}) for name, changed in own.items()
-        )]  # fmt: skip
-        renamed |= {name: copy_of(program, name).name for name in own}
-        for of, changed in ((program, common), *((copy_of(program, n), {**common, **c}) for n, c in own.items())):
+        copies = {name: copy_of(program, name) for name in own}
+        renamed |= {name: copy.name for name, copy in copies.items()}
+        changes = [(program, common), *((copy, {**common, **own[name]}) for name, copy in copies.items())]
+        pous[key] = [_with_values(of, changed) for of, changed in changes]
+        for of, changed in changes:
             parts += [
                 replace(one, target=f"{of.name.lower()}.{path}") for path, one in changed.items() if _is_part(path)
             ]

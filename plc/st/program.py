@@ -444,14 +444,15 @@ def program_class(
 
 def _with_published(unit: CompiledUnit, program: CompiledProgram, paths: Sequence[str]) -> CompiledProgram:
     """Return `program` with these parts of its variables, and of global variables, as local variables."""
-    known = {v.name for v in program.variables}
-    found = []
+    if not paths:
+        return program
+    known, declared, found = {v.name for v in program.variables}, VariablePaths(unit, program, ()), []
     for path in (path for path in dict.fromkeys(paths) if path not in known):
-        place = VariablePaths(unit, program, ()).place(path)
+        place = declared.place(path)
         if place is not None and place[0].path == path and _tag_kind(place[0].kind) not in (None, TagKind.MESSAGE):
             *steps, last = place[0].keys
             found.append(ProgramVariable(path, "local", place[0].kind, False, last, place[1], steps=tuple(steps)))
-    return replace(program, variables=(*program.variables, *found)) if found else program
+    return replace(program, variables=(*program.variables, *found))
 
 
 def with_interface(made: type[StProgram], interface: Mapping[str, Variable]) -> type[StProgram]:

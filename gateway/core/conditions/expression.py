@@ -29,6 +29,8 @@ Words = Collection[str]
 NO_WORDS: Mapping[str, Words] = {}
 _OWN = ("plc.late", "command_pending")
 """``plc.late``: the seconds by which the last scan was late; ``command pending``: a remote command was sent in the last 5 s."""
+_NAMED = ast.Name | ast.Attribute | ast.Subscript
+"""The nodes that are names of tags and variables."""
 Look = Callable[[str, str], Any]
 """``look(function, name)`` returns the current value of a function of a tag or variable, or None if it is unknown."""
 
@@ -47,7 +49,7 @@ def names_in_text(text: str) -> list[str]:
     names, waiting = [], [found.tree]
     while waiting:
         node = waiting.pop()
-        if isinstance(node, ast.Name | ast.Attribute | ast.Subscript):
+        if isinstance(node, _NAMED):
             names.append(dotted(node))
         elif isinstance(node, ast.Call):
             waiting += node.args
@@ -126,7 +128,7 @@ class Expression:
         if isinstance(node, ast.Call):
             self._check_call(node)
             return
-        if isinstance(node, ast.Name | ast.Attribute | ast.Subscript):
+        if isinstance(node, _NAMED):
             self._check_name(node)
             return
         if isinstance(node, ast.Compare):
@@ -160,10 +162,10 @@ class Expression:
         if not isinstance(text, ast.Constant) or not isinstance(text.value, str):
             return
         words: Words = ()
-        if isinstance(asked, ast.Name | ast.Attribute | ast.Subscript):
+        if isinstance(asked, _NAMED):
             words = self._words.get(dotted(asked), ())
         elif isinstance(asked, ast.Call) and isinstance(asked.func, ast.Name) and len(asked.args) == 1:
-            value = asked.func.id == "value" and isinstance(asked.args[0], ast.Name | ast.Attribute | ast.Subscript)
+            value = asked.func.id == "value" and isinstance(asked.args[0], _NAMED)
             words = self._words.get(dotted(asked.args[0]), ()) if value else WORDS.get(asked.func.id, ())
         if isinstance(words, Mapping) and text.value in words:
             text.value = words[text.value]
@@ -196,7 +198,7 @@ class Expression:
 def _value(node: ast.expr, look: Look) -> Any:
     if isinstance(node, ast.Constant):
         return node.value
-    if isinstance(node, ast.Name | ast.Attribute | ast.Subscript):
+    if isinstance(node, _NAMED):
         name = dotted(node)
         return name == "true" if name in ("true", "false") else _known(as_decimal(look("value", name)))
     if isinstance(node, ast.Call):

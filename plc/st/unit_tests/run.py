@@ -81,7 +81,7 @@ class _TestContext(Context):
 
     __slots__ = ("_advances", "_failed", "_ordered", "counts", "finished")
 
-    def __init__(self, recorded: set[Any], failed: Callable[[int], None] | None) -> None:
+    def __init__(self, recorded: set[Any], failed: Callable[[int], None]) -> None:
         """`failed` is called with the number of an assertion when it fails for the first time."""
         super().__init__()
         self._failed = failed
@@ -103,7 +103,7 @@ class _TestContext(Context):
         if not count.failed:
             count.failed, count.t_ns = not holds, self.now_ns
             count.values = shown if holds else copy.deepcopy(shown)  # an array may change after this
-            if not holds and self._failed is not None:
+            if not holds:
                 self._failed(number)
 
     @staticmethod
